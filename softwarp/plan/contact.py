@@ -143,13 +143,13 @@ def _add_soft(
     body = scene.bodies[part]
     surface = body.contact_surface
     if surface is None:
-        return touching.add_soft_surface(_skin(scene, part) + first_node, places, name=body.name)
+        return touching.add_soft_surface(outer_skin(scene, part) + first_node, places, name=body.name)
     if len(surface.triangles):
         return touching.add_soft_surface(surface.triangles + first_point, places, name=body.name)
     return touching.add_soft_points(np.arange(len(surface.points)) + first_point, places, name=body.name)
 
 
-def _skin(scene: Scene, part: Handle) -> NDArray[np.int32]:
+def outer_skin(scene: Scene, part: Handle) -> NDArray[np.int32]:
     """Triangles of a soft body that something can reach, shape (tri, 3).
 
     Only the body itself reaches the walls of its closed chambers: nothing else may start inside them.

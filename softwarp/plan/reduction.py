@@ -12,6 +12,7 @@ from softwarp.model.codes import TURNED
 from softwarp.model.floating import RIGID
 from softwarp.model.reduction import ReductionModel
 from softwarp.plan.cavities import MembraneLayout
+from softwarp.plan.contact import outer_skin
 from softwarp.plan.floating import TURNING, Frame, floating_frame, floating_model
 from softwarp.plan.patches import chunks
 from softwarp.plan.soft import SoftArrays, SoftLayout
@@ -60,7 +61,7 @@ def touch_dofs(scene: Scene, soft: SoftLayout, node_dof: IntArray, dof_count: in
 
 def _touching(scene: Scene, soft: SoftLayout) -> NDArray[Any]:
     """Nodes of reduced bodies that a contact may find, ascending; none in scenes without contact."""
-    parts = {int(part) for pair in scene.pairs for part in (pair.a, pair.b) if part.kind == "soft body"}
+    parts = {int(part): part for pair in scene.pairs for part in (pair.a, pair.b) if part.kind == "soft body"}
     chosen = [np.empty(0, dtype=np.int64)]
     for body, _ in _reduced(scene):
         if body not in parts:
@@ -68,7 +69,7 @@ def _touching(scene: Scene, soft: SoftLayout) -> NDArray[Any]:
         spec, start = scene.bodies[body], soft.node_start[body]
         skin = spec.contact_surface
         if skin is None:
-            chosen.append(start + np.unique(spec.mesh.surface()))
+            chosen.append(start + np.unique(outer_skin(scene, parts[body])))
         else:
             chosen.append(start + np.unique(skin.node[skin.weight != 0.0]))
     nodes = np.unique(np.concatenate(chosen))
@@ -225,8 +226,7 @@ def _nodes(
     of = modes.node_body[nodes]
     parts = [b.rows(b.modes) for b in bodies]
     basis = [parts[b][n - bodies[b].first_node].ravel() for n, b in zip(nodes, of, strict=True)]
-    size = np.array([part.size for part in basis])
-    start = np.cumsum(size) - size
+    start, basis = _kept(basis)
     place = np.full(len(soft.nodes), -1)
     place[nodes] = np.arange(len(nodes))
     order = np.argsort(of, kind="stable")
@@ -255,6 +255,16 @@ def _nodes(
         "touch_basis": start[place[touching]],
         "block_touch": np.array([(t[0], t[-1] + 1) if t.size else (0, 0) for t in ends]),
     }
+
+
+def _kept(basis: list[FloatArray]) -> tuple[NDArray[Any], list[FloatArray]]:
+    """Where the modes of nodes start, and those that are kept: nodes that no mode moves share one place of zeros."""
+    rests = np.array([not part.any() for part in basis])
+    size = np.where(rests, 0, [part.size for part in basis])
+    start = np.cumsum(size) - size
+    start[rests] = size.sum()
+    zeros = max((part.size for part, at_rest in zip(basis, rests, strict=True) if at_rest), default=0)
+    return start, [part for part, at_rest in zip(basis, rests, strict=True) if not at_rest] + [np.zeros(zeros)]
 
 
 def _pairs(

@@ -8,7 +8,7 @@ import softwarp as sw
 from softwarp.envs.reduced import reduce_body
 from softwarp.envs.scenes.bubble_motion import BubbleSceneConfig, build_bubble_scene
 from softwarp.envs.tasks.bubble_motion import MODES
-from softwarp.meshing.board_geometry import FLOOR, PITCH, chamber_centres
+from softwarp.meshing.board_geometry import FLOOR, HALF, PITCH, chamber_centres
 
 PRESSURES = (100.0e3, 200.0e3, 400.0e3)  # Pa
 # Rise [m] of the floor over the middle chamber, filled alone to these: floor of 6 mm, E = 3 MPa, nu = 0.3. Quadratic
@@ -84,6 +84,18 @@ def test_accurate_floor():
     """In its 48 modes the board is within 3 % of the converged rise."""
     found = rises(fidelity="accurate", precision="float32")
     np.testing.assert_allclose(found, CONVERGED, rtol=0.03)
+
+
+@pytest.mark.slow
+def test_walls_of_chambers_are_not_ready_for_contact():
+    """Of a board in modes the outside alone can be touched: the floor, and the sides."""
+    sim, _ = build(fidelity="accurate", precision="float32")
+    modes = sim.model.reduction
+    rest = sim.model.node_rest[modes.node.numpy()[modes.touch_listed.numpy()]]
+    is_floor = np.abs(rest[:, 2] - FLOOR) < 1e-6
+    is_side = np.abs(rest[:, :2]).max(axis=1) > HALF - 1e-6
+    assert (is_floor | is_side).all()
+    assert is_floor.sum() > 900
 
 
 @pytest.mark.slow

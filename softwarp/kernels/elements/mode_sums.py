@@ -10,38 +10,52 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 
-# Three rows of Phi times amplitudes, into three rows; a register of sums is halved until 16 bytes are left. Products
-# are fused with their sums, and registers of 64 bytes asked for: both only come when a function asks.
-_COLLECT_MODES = """
+# Three rows of Phi times amplitudes, into three rows each; a register of sums is halved until 16 bytes are left.
+# Products are fused with sums, and registers of 64 bytes asked for: both only come when a function asks.
+_COLLECT = """
 typedef REAL wide_t __attribute__((vector_size(64), aligned(4)));
 typedef REAL half_t __attribute__((vector_size(32), aligned(4)));
 typedef REAL part_t __attribute__((vector_size(16), aligned(4)));
+const int count = COUNT;  // arrays of amplitudes: what is read of Phi is used for each
 struct Sum {
-    static __attribute__((min_vector_width(512))) void rows(const REAL* b, const REAL* q, int stride, REAL* out) {
+    static __attribute__((min_vector_width(512))) void rows(const REAL* b, const REAL** q, int stride, REAL** out) {
         #pragma clang fp contract(fast)
-        wide_t s[3] = {}, x, y;
+        wide_t s[count][3] = {}, x, y[count];
         for (int k = 0; k < stride; k += 64 / sizeof(REAL)) {
-            __builtin_memcpy(&y, q + k, sizeof(y));
+            for (int i = 0; i < count; ++i) __builtin_memcpy(y + i, q[i] + k, sizeof(*y));
             for (int c = 0; c < 3; ++c) {
                 __builtin_memcpy(&x, b + c * stride + k, sizeof(x));
-                s[c] += x * y;
+                for (int i = 0; i < count; ++i) s[i][c] += x * y[i];
             }
         }
-        for (int c = 0; c < 3; ++c) {
-            half_t h[2];
-            __builtin_memcpy(h, s + c, sizeof(h));
-            h[0] += h[1];
-            part_t p[2];
-            __builtin_memcpy(p, h, sizeof(p));
-            p[0] += p[1];
-            REAL sum = 0;
-            for (int k = 0; k < (int)(16 / sizeof(REAL)); ++k) sum += p[0][k];
-            out[c] = sum;
-        }
+        for (int i = 0; i < count; ++i)
+            for (int c = 0; c < 3; ++c) {
+                half_t h[2];
+                __builtin_memcpy(h, s[i] + c, sizeof(h));
+                h[0] += h[1];
+                part_t p[2];
+                __builtin_memcpy(p, h, sizeof(p));
+                p[0] += p[1];
+                REAL sum = 0;
+                for (int k = 0; k < (int)(16 / sizeof(REAL)); ++k) sum += p[0][k];
+                out[i][c] = sum;
+            }
     }
 };
-Sum::rows(&wp::index(basis, at), &wp::index(amplitude, w, first), stride, &wp::index(target_out, w, row));
+const REAL* q[] = {AMPLITUDES};
+REAL* out[] = {TARGETS};
+Sum::rows(&wp::index(basis, at), q, stride, out);
 """
+_ONE = {
+    "COUNT": "1",
+    "AMPLITUDES": "&wp::index(amplitude, w, first)",
+    "TARGETS": "&wp::index(target_out, w, row)",
+}
+_BOTH = {
+    "COUNT": "2",
+    "AMPLITUDES": "&wp::index(amplitude, w, first), &wp::index(other, w, first)",
+    "TARGETS": "&wp::index(target_out, w, row), &wp::index(other_out, w, row)",
+}
 # The same of eight worlds; even and odd modes apart, so that sums need not wait for each other.
 _COLLECT_WORLDS = """
 #pragma clang fp contract(fast)
@@ -106,6 +120,14 @@ for (int k = 0; k < stride; ++k) out[k] += x * b[k] + y * b[stride + k] + z * b[
 """
 
 
+def _collect(words: dict[str, str], real: str) -> str:
+    """Native code of sums over modes for one scalar type."""
+    code = _COLLECT
+    for word, text in words.items():
+        code = code.replace(word, text)
+    return code.replace("REAL", real)
+
+
 @cache
 def functions(variant: Variant) -> SimpleNamespace:
     """Sums over the modes of a node, and over the components of a force at it."""
@@ -158,7 +180,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     of_worlds = variant.lanes > 1
     name = "double" if real is wp.float64 else "float"
 
-    @wp.func_native((_COLLECT_WORLDS if of_worlds else _COLLECT_MODES).replace("REAL", name))
+    @wp.func_native(_COLLECT_WORLDS if of_worlds else _collect(_ONE, name))
     def displace(
         basis: wp.array(dtype=real),
         at: int,
@@ -184,10 +206,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     ):
         """Add what a force in three rows does on every mode."""
 
-    if not of_worlds:
-        return SimpleNamespace(displace=displace, displace_both=displace_both_each, push_modes=push_modes)
-
-    @wp.func_native(_COLLECT_PAIR)
+    @wp.func_native(_COLLECT_PAIR if of_worlds else _collect(_BOTH, name))
     def displace_both(
         basis: wp.array(dtype=real),
         at: int,
