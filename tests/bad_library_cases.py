@@ -176,7 +176,7 @@ def _fit_calls() -> list[Call]:
             parameter | {"item": 0, "step": 0.01},
             {"start": NONE, "name": {"text"}, "unit": texts, "target": texts, "item": NONE},
         ),
-        Call("fit", identification.fit, fit, {"batch": NONE}),
+        Call("fit", identification.fit, fit, {"batch": NONE, "method": NONE}),
         Call("PointEffector", control.PointEffector, {"markers": (0,), "axes": "xyz", "weight": 1.0}),
         Call("OrientationEffector", control.OrientationEffector, {"frame": 0, "length": 0.1, "axes": "xyz"}),
         Call("TargetPath", control.TargetPath, {"times": np.array([0.0, 1.0]), "targets": np.zeros((2, 3))}),

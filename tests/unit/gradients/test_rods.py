@@ -9,7 +9,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.gradients import Equilibrium, Rollout, States
+from softwarp.gradients import Rollout, States
 from tests.gradient_cases import STEPS, Inputs, gradients
 
 WAYPOINTS = 6  # nodes of cables that rods carry, behind those of soft bodies
@@ -240,5 +240,3 @@ def test_refusals() -> None:
         Rollout(scene(integrator="bdf2"))
     with pytest.raises(ValueError, match="rod 'stem' has no gradient with project_tangent=False yet"):
         Rollout(scene(project_tangent=False))
-    with pytest.raises(ValueError, match="equilibria of rods"):
-        Equilibrium(scene())
