@@ -11,6 +11,10 @@ LIMIT = 60.0  # s of simulated time
 LOOK = 20  # steps between two looks at the speed
 
 
+class NotAtRestError(ValueError):
+    """The start state does not come to rest."""
+
+
 def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
     """Step a simulation until nothing moves, then take away what is left of velocities; its time is 0 again.
 
@@ -23,7 +27,7 @@ def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
         dt: Its time step [s].
 
     Raises:
-        ValueError: If a step fails, or something still moves after ``LIMIT``.
+        NotAtRestError: If a step fails, or something still moves after ``LIMIT``.
     """
     work = f"{owner}: coming to rest"
     for look in range(max(1, round(LIMIT / (LOOK * dt)))):
@@ -31,7 +35,7 @@ def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
             sim.step()
         speed = max(float(v.abs().max()) for v in (sim.node_v, sim.frame_twist) if v.numel())
         if (status := Status(int(sim.status.max()))).failed:  # and would again: it has been rolled back
-            raise ValueError(
+            raise NotAtRestError(
                 f"{owner}: the start state fails ({status.name}) while it comes to rest; check loads, stiffness and "
                 f"the time step of {dt:g} s, or set settle=False"
             )
@@ -39,7 +43,7 @@ def bring_to_rest(owner: str, sim: Simulation, dt: float) -> None:
             break
         notices.progress(work, f"{speed:.1g} m/s after {(look + 1) * LOOK * dt:.3g} s, of {LIMIT:g} s at most")
     else:
-        raise ValueError(
+        raise NotAtRestError(
             f"{owner}: the start state still moves at {speed:.3g} m/s after {LIMIT:g} s; check loads, stiffness and "
             "damping, or set settle=False"
         )

@@ -57,6 +57,7 @@ from torch import Tensor
 from softwarp.builder import ModelBuilder
 from softwarp.envs import randomization, rewards
 from softwarp.envs.options.trunk_cup import TrunkCupConfig
+from softwarp.envs.rest import NotAtRestError
 from softwarp.envs.scenes.trunk import LONG_CABLES, SHORT_CABLES, STATIONS
 from softwarp.envs.scenes.trunk_cup import TrunkCupScene, build_trunk_cup_scene, place_grasp, wrapped
 from softwarp.envs.sums import in_order, mean_of
@@ -142,7 +143,7 @@ class TrunkCup(CableReach):
     def _settle(self) -> None:
         try:
             super()._settle()
-        except RuntimeError as error:
+        except NotAtRestError as error:
             raise ValueError(self._lost()) from error
 
     def _lost(self) -> str:
