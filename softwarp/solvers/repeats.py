@@ -98,7 +98,8 @@ class RepeatingEuler:
         self.progress.zero_()
         self.order.zero_()
         inputs = [s.options.repeat_swing, s.lanes, s.world_count, s.work.swing.real]
-        s.each_real(self.k.choose, None, inputs, [self.again, self.order, self.progress])
+        s.each_real(self.k.choose, None, inputs, [self.again, self.progress])
+        s.each_real(self.k.number, None, [s.lanes, self.again], [self.order])
         self._go_on(0)
 
     def _keep(self) -> None:

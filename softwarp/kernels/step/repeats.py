@@ -44,21 +44,35 @@ def kernels(variant: Variant) -> SimpleNamespace:
         swing_in: wp.array3d(dtype=real),
         # Workspace out
         again_out: wp.array3d(dtype=wp.int32),
-        order_out: wp.array(dtype=wp.int32),
         progress_out: wp.array(dtype=wp.int32),
     ):
-        """A world repeats its step if that swings a segment by more than ``limit`` [rad], or is not finite.
-
-        In which order depends on chance on a GPU, what comes of it does not.
-        """
+        """A world repeats its step if that swings a segment by more than ``limit`` [rad], or is not finite."""
         pack, lane = wp.tid()
         world = pack * lanes + lane
         again = int(0)
         if world < world_count:
             if not (swing_in[pack, 0, lane] <= limit):
                 again = int(1)
-                order_out[wp.atomic_add(progress_out, wp.static(COUNT), 1)] = world  # few worlds
+                wp.atomic_add(progress_out, wp.static(COUNT), 1)  # of integers: the same in any order
         again_out[pack, 0, lane] = again
+
+    @wp.kernel(module=module, enable_backward=False)
+    def number(
+        lanes: int,
+        # Workspace in
+        again_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        order_out: wp.array(dtype=wp.int32),
+    ):
+        """Worlds that repeat a step, few of all, by their numbers: chance has no say in who shares places with whom."""
+        pack, lane = wp.tid()
+        if again_in[pack, 0, lane] == 0:
+            return
+        world = pack * lanes + lane
+        before = int(0)
+        for other in range(world):
+            before += again_in[other // lanes, 0, other % lanes]
+        order_out[before] = world
 
     @wp.kernel(module=module, enable_backward=False)
     def go_on(
@@ -162,5 +176,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 value_out[world, row] = value_in[sample, row]
 
     return SimpleNamespace(
-        choose=choose, go_on=go_on, take=take, take_integers=take_integers, give=give, give_integers=give_integers
+        choose=choose,
+        number=number,
+        go_on=go_on,
+        take=take,
+        take_integers=take_integers,
+        give=give,
+        give_integers=give_integers,
     )
