@@ -14,7 +14,16 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import anderson, contact, coulomb, coulomb_tiers, coulomb_warp, coulomb_warp_newton, delassus
+from softwarp.kernels.rows import (
+    anderson,
+    contact,
+    contact_force,
+    coulomb,
+    coulomb_tiers,
+    coulomb_warp,
+    coulomb_warp_newton,
+    delassus,
+)
 from softwarp.model.codes import FAR, USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -117,7 +126,7 @@ class ContactResponse:
         self.order = static_rows + 3 * self.capacity
         self.packs, self.lanes = rows.shape(variant, world_count)
         self.width = self.packs * self.lanes if variant.world_fastest else self.packs
-        self.k = contact.kernels(variant)
+        self.k, self.k_force = contact.kernels(variant), contact_force.kernels(variant)
         self.k_row = delassus.kernels(variant)
         self.k_law = coulomb.kernels(variant)
         structure = (symbolic, index, dof_free, variant, world_count, static_rows, contacts, device)
@@ -286,12 +295,12 @@ class ContactResponse:
         inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
         if modes is None or modes.forces is None:
             if self.variant.world_fastest and self.size <= FEW_DOFS:
-                self._each_real(self.k.gather_force, self.size, inputs, [target.real])
+                self._each_real(self.k_force.gather_force, self.size, inputs, [target.real])
             else:
-                self._each_real(self.k.add_force, None, inputs, [target.real])
+                self._each_real(self.k_force.add_force, None, inputs, [target.real])
             return
         modes.forces.zero()
-        self._each_real(self.k.add_force, None, inputs, [modes.forces.real])
+        self._each_real(self.k_force.add_force, None, inputs, [modes.forces.real])
         modes.project(modes.forces, target)
 
     # Launches

@@ -17,7 +17,6 @@ from softwarp.kernels.rows import touch
 from softwarp.model.codes import SLOTS
 
 ROUNDING = 4.0  # eps of a contact's largest coordinate, up to which distances measured twice differ by rounding
-CHUNK = 8  # slots whose loop the compiler unrolls; a part of SLOTS
 UNKNOWN = 1.0e12  # distance from which a measurement found nothing [m]
 
 
@@ -544,70 +543,6 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                     s = mul(side_in[w, t + 3 * r], change0) + mul(side_in[w, t + 3 * r + 1], change1)
                     y_out[w, row + r] += s + mul(side_in[w, t + 3 * r + 2], change2)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def add_force(
-        # Model
-        dof_free: wp.array2d(dtype=real),
-        # Workspace in
-        count_in: wp.array3d(dtype=wp.int32),
-        dof_in: wp.array3d(dtype=wp.int32),
-        weight_in: wp.array3d(dtype=real),
-        lever_in: wp.array3d(dtype=real),
-        axes_in: wp.array3d(dtype=real),
-        multiplier_in: wp.array3d(dtype=real),
-        f_scale: real,
-        # Workspace out
-        target_out: wp.array3d(dtype=real),
-    ):
-        """target += f P H' multiplier of all contacts of one world, in their order."""
-        pack, lane = wp.tid()
-        for contact in range(count_in[pack, 0, lane]):
-            for slot in range(int(wp.static(SLOTS))):
-                dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
-                if dof >= 0:
-                    force = vec3()
-                    for axis in range(3):
-                        h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
-                        force += h * (multiplier_in[pack, 3 * contact + axis, lane] * f_scale)
-                    for r in range(3):
-                        if dof >= dof_free.shape[0] or dof_free[dof, r] > real(0.0):
-                            target_out[pack, 3 * dof + r, lane] += force[r]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def gather_force(
-        # Model
-        dof_free: wp.array2d(dtype=real),
-        # Workspace in
-        count_in: wp.array3d(dtype=wp.int32),
-        dof_in: wp.array3d(dtype=wp.int32),
-        weight_in: wp.array3d(dtype=real),
-        lever_in: wp.array3d(dtype=real),
-        axes_in: wp.array3d(dtype=real),
-        multiplier_in: wp.array3d(dtype=real),
-        f_scale: real,
-        # Workspace out
-        target_out: wp.array3d(dtype=real),
-    ):
-        """The same with a thread for every dof, for GPUs, where one for all of a world waits for each of its sums."""
-        pack, dof, lane = wp.tid()
-        for contact in range(count_in[pack, 0, lane]):
-            is_touched = bool(False)
-            for part in range(wp.static(SLOTS // CHUNK)):  # unrolled: these loads do not wait for each other
-                for place in range(wp.static(CHUNK)):
-                    row = wp.static(SLOTS) * contact + part * wp.static(CHUNK) + place
-                    if dof_in[pack, row, lane] == dof:
-                        is_touched = True
-            if is_touched:
-                for slot in range(int(wp.static(SLOTS))):
-                    if dof_in[pack, wp.static(SLOTS) * contact + slot, lane] == dof:
-                        force = vec3()
-                        for axis in range(3):
-                            h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
-                            force += h * (multiplier_in[pack, 3 * contact + axis, lane] * f_scale)
-                        for r in range(3):
-                            if dof >= dof_free.shape[0] or dof_free[dof, r] > real(0.0):
-                                target_out[pack, 3 * dof + r, lane] += force[r]
-
     return SimpleNamespace(
         find_path=find_path,
         scatter_rows=scatter_rows,
@@ -618,7 +553,5 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         free_gap=free_gap,
         add_change=add_change,
         add_change_on_paths=add_change_on_paths,
-        add_force=add_force,
-        gather_force=gather_force,
         slot_row=slot_row,
     )

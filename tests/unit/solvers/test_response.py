@@ -8,6 +8,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact as contact_kernels
+from softwarp.kernels.rows import contact_force
 from softwarp.plan.ordering import analyze
 from softwarp.solvers.collision.contact_list import SLOTS
 from softwarp.solvers.sides import longest_path
@@ -36,7 +37,7 @@ from tests.response_cases import (
 def test_slots_agree() -> None:
     """The kernels, which may not import the solvers, count the same slots as the contact list."""
     assert contact_kernels.SLOTS == SLOTS
-    assert SLOTS % contact_kernels.CHUNK == 0
+    assert SLOTS % contact_force.CHUNK == 0
 
 
 def test_longest_path_bounds_every_union(rng: np.random.Generator) -> None:
@@ -75,7 +76,7 @@ def test_dofs_that_gather_forces_have_the_same_bits(rng: np.random.Generator) ->
     start, found = rng.standard_normal((case.worlds, n)), []
     c = response.contacts
     given = [response.dof_free, c.count.real, c.dof.real, c.weight.real, c.lever.real, c.axes.real, c.multiplier.real]
-    for kernel, items in ((response.k.add_force, ()), (response.k.gather_force, (case.n,))):
+    for kernel, items in ((response.k_force.add_force, ()), (response.k_force.gather_force, (case.n,))):
         put(case.u, list(start))
         dim = (case.u.real.shape[0], *items, case.u.real.shape[2])
         wp.launch(kernel, dim=dim, inputs=[*given, 0.3], outputs=[case.u.real], device="cpu")

@@ -1,0 +1,125 @@
+"""Forces of contacts on the unknowns of their world, f P H' multiplier. Theory: docs/theory/contact.md."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.rows import contact as contact_rows
+from softwarp.model.codes import SLOTS
+
+CHUNK = 8  # slots whose loop the compiler unrolls; a part of SLOTS
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type."""
+    real = variant.real
+    vec3 = wp.types.vector(3, real)
+    module = variant.module("contact_force")
+    slot_row = contact_rows.kernels(variant).slot_row
+
+    @wp.func
+    def add_slot(
+        dof_free: wp.array2d(dtype=real),
+        weight: wp.array3d(dtype=real),
+        lever: wp.array3d(dtype=real),
+        axes: wp.array3d(dtype=real),
+        multiplier: wp.array3d(dtype=real),
+        f_scale: real,
+        pack: int,
+        lane: int,
+        contact: int,
+        slot: int,
+        dof: int,
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Add the force of one contact on the dof at one of its slots."""
+        force = vec3()
+        for axis in range(3):
+            h = slot_row(weight, lever, axes, pack, lane, contact, slot, axis)
+            force += h * (multiplier[pack, 3 * contact + axis, lane] * f_scale)
+        for r in range(3):
+            if dof >= dof_free.shape[0] or dof_free[dof, r] > real(0.0):
+                target_out[pack, 3 * dof + r, lane] += force[r]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_force(
+        # Model
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        dof_in: wp.array3d(dtype=wp.int32),
+        weight_in: wp.array3d(dtype=real),
+        lever_in: wp.array3d(dtype=real),
+        axes_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        f_scale: real,
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """target += f P H' multiplier of all contacts of one world, in their order."""
+        pack, lane = wp.tid()
+        for contact in range(count_in[pack, 0, lane]):
+            for slot in range(int(wp.static(SLOTS))):
+                dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
+                if dof >= 0:
+                    add_slot(
+                        dof_free,
+                        weight_in,
+                        lever_in,
+                        axes_in,
+                        multiplier_in,
+                        f_scale,
+                        pack,
+                        lane,
+                        contact,
+                        slot,
+                        dof,
+                        target_out,
+                    )
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gather_force(
+        # Model
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        dof_in: wp.array3d(dtype=wp.int32),
+        weight_in: wp.array3d(dtype=real),
+        lever_in: wp.array3d(dtype=real),
+        axes_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        f_scale: real,
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """The same with a thread for every dof, for GPUs, where one for all of a world waits for each of its sums."""
+        pack, dof, lane = wp.tid()
+        for contact in range(count_in[pack, 0, lane]):
+            is_touched = bool(False)
+            for part in range(wp.static(SLOTS // CHUNK)):  # unrolled: these loads do not wait for each other
+                for place in range(wp.static(CHUNK)):
+                    row = wp.static(SLOTS) * contact + part * wp.static(CHUNK) + place
+                    if dof_in[pack, row, lane] == dof:
+                        is_touched = True
+            if is_touched:
+                for slot in range(int(wp.static(SLOTS))):
+                    if dof_in[pack, wp.static(SLOTS) * contact + slot, lane] == dof:
+                        add_slot(
+                            dof_free,
+                            weight_in,
+                            lever_in,
+                            axes_in,
+                            multiplier_in,
+                            f_scale,
+                            pack,
+                            lane,
+                            contact,
+                            slot,
+                            dof,
+                            target_out,
+                        )
+
+    return SimpleNamespace(add_force=add_force, gather_force=gather_force)
