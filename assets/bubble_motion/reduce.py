@@ -112,7 +112,7 @@ def main() -> None:
         seed=given.seed,
     )
     print(small.told(), {key: value for key, value in small.report.items() if key != "amplitudes"})
-    small.save(given.out, compact=True)
+    small.save(given.out, compact=True, resolution=1e-6)  # of floors that rise by 6 mm
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from softwarp import checks
 from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
 from softwarp.reduction.basis import deforming
-from softwarp.reduction.packing import pack, unpack
+from softwarp.reduction.packing import RESOLUTION, pack, unpack
 
 FORMAT = "softwarp.reduction"
 VERSION = 4  # 4: quadratic elements; 3: a floating frame; 2: packed modes, of a mesh that the file does not hold
@@ -188,16 +188,17 @@ class Reduction:
     def _rigid_told(self) -> str:
         return "in a floating frame" if self.turns else f"{self.rigid} rigid"
 
-    def save(self, path: str | os.PathLike[str], *, compact: bool = False) -> None:
+    def save(self, path: str | os.PathLike[str], *, compact: bool = False, resolution: float = RESOLUTION) -> None:
         """Write an ``.npz`` file, whole or not at all.
 
         Args:
             path: Of the file.
-            compact: Modes to 0.1 um of the motion that they were made from, of a symmetric body one half, and of the
-                mesh what tells it from others: a tenth as large. ``load`` then needs the mesh.
+            compact: Modes to ``resolution`` of the motion that they were made from, of a symmetric body one half, and
+                of the mesh what tells it from others: a tenth as large. ``load`` then needs the mesh.
+            resolution: Of a compact file's modes [m].
 
         Raises:
-            ValueError: If it is to be compact and the masses are not known.
+            ValueError: If it is to be compact and the masses are not known, or the resolution is not positive.
             WriteError: If it cannot be written.
         """
         version = FLOATING_VERSION if self.turns else FIXED_VERSION
@@ -209,11 +210,12 @@ class Reduction:
         arrays |= {_THIN + name: w for name, w in self.membrane_weight.items()}
         if self.share is not None:
             arrays["share"] = self.share
+        checks.number(resolution, "resolution", above=0.0)
         if compact:
             if self.share is None:
                 raise ValueError(f"reduction {self.name!r}: it does not know the nodes' masses; train it again")
             about["mesh"] = _digest(self.tets)
-            packed = pack(self.modes[self.rigid :], self._sizes(), self.nodes)
+            packed = pack(self.modes[self.rigid :], self._sizes(), self.nodes, resolution)
             arrays |= {"rigid_modes": self.modes[: self.rigid], "nodes": self.nodes.astype(np.float32), **packed}
         else:
             arrays |= {"nodes": self.nodes, "tets": self.tets, "modes": self.modes}

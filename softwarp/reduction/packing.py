@@ -1,9 +1,9 @@
 """Modes in few bytes: whole multiples of a length, of one half of the body where modes are their own mirror images.
 
 A mode that hardly moves needs few digits. Its unit is the number that an amplitude as large as in the training motion
-makes a step of ``RESOLUTION`` of; differences from node to node are kept, byte by byte, so that a file compresses them.
-Rounding leaves modes orthonormal to ``COARSEST`` only: Gram and Schmidt with the nodes' masses, when a file is read,
-make them so to the last bits, whatever the file holds.
+makes a step of 0.1 um of, or of what else is asked for; differences from node to node are kept, byte by byte, so that a
+file compresses them. Rounding leaves modes orthonormal to their largest unit only: Gram and Schmidt with the nodes'
+masses, when a file is read, make them so to the last bits, whatever the file holds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from softwarp.reduction.basis import orthonormal
 
 FloatArray = NDArray[np.float64]
 RESOLUTION = 1e-7  # m
-COARSEST = 2e-3  # largest unit of a mode, whose displacements are about 1
+COARSEST = 2e-3  # largest unit of a mode, whose displacements are about 1, at ``RESOLUTION``
 MIRRORED = 1e-6  # of the body's size: how far a node's mirror image may be off
 MIRROR = np.array([1.0, -1.0, 1.0])  # the plane y = 0
 
@@ -57,17 +57,24 @@ def halves(displacements: FloatArray, nodes: NDArray[np.floating[Any]]) -> Float
     return np.concatenate([0.5 * (displacements + mirrored), 0.5 * (displacements - mirrored)])
 
 
-def pack(modes: FloatArray, sizes: Sequence[float] | None, nodes: NDArray[np.floating[Any]]) -> dict[str, NDArray[Any]]:
+def pack(
+    modes: FloatArray,
+    sizes: Sequence[float] | None,
+    nodes: NDArray[np.floating[Any]],
+    resolution: float = RESOLUTION,
+) -> dict[str, NDArray[Any]]:
     """Modes as arrays that compress well.
 
     Args:
         modes: (mode, node, 3).
         sizes: How large their amplitudes are [m], (mode,); None keeps the same digits of all.
         nodes: At rest [m], (node, 3).
+        resolution: What a displacement is rounded to, of the amplitudes in ``sizes`` [m].
     """
     unit = np.full(len(modes), COARSEST * 1e-2)
     if sizes is not None:
-        unit = np.minimum(RESOLUTION / np.maximum(np.asarray(sizes, dtype=np.float64), 1e-30), COARSEST)
+        coarsest = COARSEST * resolution / RESOLUTION
+        unit = np.minimum(resolution / np.maximum(np.asarray(sizes, dtype=np.float64), 1e-30), coarsest)
     unit = np.maximum(unit, np.abs(modes).max(axis=(1, 2)) / 2**30)
     parity = _parity(modes, nodes, unit)
     kept = np.flatnonzero(images(nodes) >= np.arange(len(nodes))) if parity.all() else np.arange(len(nodes))

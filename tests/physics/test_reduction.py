@@ -327,6 +327,13 @@ def test_compact_file(trained, tmp_path):
     assert (np.abs(again.modes - small.modes).max(axis=(1, 2)) * sizes).max() < 1e-7
     flat = again.modes.reshape(len(sizes), -1) * np.sqrt(np.repeat(again.share, 3))
     np.testing.assert_allclose(flat @ flat.T, np.eye(len(sizes)), atol=1e-12)
+    coarse = tmp_path / "coarse.npz"
+    small.save(coarse, compact=True, resolution=1e-6)
+    rounded = reduction.Reduction.load(coarse, SLAB)
+    assert coarse.stat().st_size < 0.9 * path.stat().st_size
+    assert 1e-7 < (np.abs(rounded.modes - small.modes).max(axis=(1, 2)) * sizes).max() < 1e-6
+    with pytest.raises(ValueError, match="resolution must be"):
+        small.save(coarse, compact=True, resolution=0.0)
     assert reduction.read_about(path)["name"] == again.name == "slab"
     np.testing.assert_array_equal(again.tet_weight, small.tet_weight)
     with pytest.raises(reduction.ReductionFileError, match="does not hold the mesh of body 'slab'"):
