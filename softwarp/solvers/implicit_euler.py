@@ -113,6 +113,7 @@ class ImplicitEuler:
             system.measure_rows()
             system.row_laws()
         system.find_contacts(h, moving=moving, look=self.pace.look)
+        control.hold_still()
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=moving)

@@ -20,8 +20,8 @@ class NewtonControl:
 
     Args:
         system: Worlds to iterate.
-        still: Keep the forces of contacts of worlds that have converged, too, so that iterations of others change
-            nothing there.
+        still: Keep the forces of contacts of worlds that have converged, too, and what their sweeps left, so that
+            iterations of others change nothing there.
 
     Attributes:
         left: 1 while worlds have not converged; of ``look_for_others``.
@@ -35,8 +35,8 @@ class NewtonControl:
         allocate, dofs = self.shard.rows, self.shard.dof_rows
         self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
         self.left = memory.zeros((1,), wp.int32, self.shard.device)
-        forces = system.multipliers.contact_forces if still else ()
-        self.still = [(force, allocate(force.real.shape[1])) for force in forces]
+        still_rows = (*system.multipliers.contact_forces, system.work.residual) if still else ()
+        self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
         count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
 
@@ -72,8 +72,14 @@ class NewtonControl:
         """Whether there are worlds that have not converged, for ``left``; what converged ones are to keep."""
         self.left.zero_()
         self.shard.each_real(self.kernels.look_for_others, None, [self.system.work.control.real], [self.left])
-        for force, held in self.still:
-            held.copy_from(force)
+        for values, held in self.still:
+            held.copy_from(values)
+
+    def hold_still(self) -> None:
+        """Give converged worlds back what they had: others' iterations, and to carry forces to new axes, change it."""
+        for values, held in self.still:
+            inputs = [self.system.work.control.real, held.real]
+            self.shard.each_real(self.kernels.hold_still, values.real.shape[1], inputs, [values.real])
 
     def advance(self, h: float) -> None:
         """Move on from the last accepted iterate of every world that has not converged."""
@@ -83,8 +89,7 @@ class NewtonControl:
         s.each_real(k.hold, count, [control], [w.multiplier.real, self.multiplier.real])
         for force in self.system.multipliers.contact_forces:
             s.each_real(k.drop_failed, force.real.shape[1], [control], [force.real])
-        for force, held in self.still:
-            s.each_real(k.hold_still, force.real.shape[1], [control, held.real], [force.real])
+        self.hold_still()
         if self.system.multipliers.exist:
             self.system.imbalance(h, inertia=True)
             s.each_real(k.refer, None, [w.norm.real], [control])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import softwarp as sw
+from softwarp.solvers import repeats
 from softwarp.solvers.repeats import RepeatingEuler
 
 THROWN = (2, 5)  # worlds
@@ -71,6 +72,27 @@ def test_a_world_repeats_a_step_by_its_own_need(device: str, path: str) -> None:
             if world not in THROWN:
                 assert torch.equal(state[world], plain.state_tensors()[name][world]), (name, world)
     assert not torch.equal(batch.frame_pose[2], plain.frame_pose[2])
+
+
+def test_worlds_that_repeat_side_by_side_keep_their_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One whose iterations have ended waits for the others, and has then what it has alone, forces of contacts too."""
+    forces = (0.03, 0.05, 0.06)
+    alone = [scene(1) for _ in forces]
+    monkeypatch.setattr(repeats, "_places", lambda _: len(forces))
+    batch = scene(len(forces))
+    contacts = 0
+    for world, force in enumerate(forces):
+        for sim, row in ((batch, world), (alone[world], 0)):
+            push(sim, (row,))
+            sim.control.rod_force[row, -1, 0] = force
+    for _ in range(3):
+        for sim in (batch, *alone):
+            sim.step()
+        contacts += int((batch.contact_count > 0).sum())
+        for name in (*SEEN, "residual"):
+            for world, sim in enumerate(alone):
+                assert torch.equal(batch.state_tensors()[name][world], sim.state_tensors()[name][0]), (name, world)
+    assert contacts > 5 and len(repeated(batch)) == len(forces)
 
 
 def test_a_world_that_cannot_be_stepped_says_so() -> None:
