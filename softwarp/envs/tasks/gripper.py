@@ -51,7 +51,7 @@ from softwarp.envs.options.gripper import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.gripper import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.gripper import GripperConfig
 from softwarp.envs.scenes.gripper import ALARM, CAPACITY, GripperScene, build_gripper_scene, object_shape
-from softwarp.envs.sums import in_order
+from softwarp.envs.sums import in_order, length_of
 from softwarp.render import Camera
 
 POSE = (  # name, entries, divisor to order 1
@@ -318,7 +318,7 @@ class Gripper(SoftEnv):
             ey = in_order(c for i, c in enumerate(corner) if i & 2) - in_order(
                 c for i, c in enumerate(corner) if not i & 2
             )
-            ey = _unit(ey - (ex * ey).sum(dim=1, keepdim=True) * ex)
+            ey = _unit(ey - in_order((ex * ey).unbind(dim=1))[:, None] * ex)
         return ex, ey, torch.linalg.cross(ex, ey)
 
     def tips(self) -> Tensor:
@@ -389,8 +389,7 @@ class Gripper(SoftEnv):
 
     def measure_distance(self) -> Tensor:
         """Object to goal [m]."""
-        distance: Tensor = torch.linalg.vector_norm(self._error(self.object_position()), dim=1)
-        return distance
+        return length_of(self._error(self.object_position()))
 
     def is_success(self, distance: Tensor) -> Tensor:
         """Within the tolerance."""
@@ -403,7 +402,7 @@ class Gripper(SoftEnv):
             return {"progress": ((self.distance - distance) / PROGRESS).clamp(0.0, 1.0), "goal": hold}
         near, scale, most = APPROACH
         tips = self.tips()
-        way = torch.linalg.vector_norm(0.5 * (tips[:, 0] + tips[:, 1]) - self.object_position(), dim=1)
+        way = length_of(0.5 * (tips[:, 0] + tips[:, 1]) - self.object_position())
         lift = 1.0 - distance / self.first_distance.clamp_min(self.config.success_tolerance)
         approach = ((way - near) / scale).clamp(0.0, most) * -self.config.approach_weight
         return {"lift": lift.clamp(-1.0, 1.0), "hold": hold, "approach": approach}
@@ -442,5 +441,4 @@ def _squashed(way: Tensor) -> Tensor:
 
 def _unit(vector: Tensor) -> Tensor:
     """Directions of vectors, shape (world, 3)."""
-    length: Tensor = torch.linalg.vector_norm(vector, dim=1, keepdim=True)
-    return vector / length.clamp_min(1.0e-9)
+    return vector / length_of(vector)[:, None].clamp_min(1.0e-9)
