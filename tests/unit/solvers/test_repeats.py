@@ -92,7 +92,7 @@ def test_worlds_that_repeat_side_by_side_keep_their_bits(monkeypatch: pytest.Mon
         for name in (*SEEN, "residual"):
             for world, sim in enumerate(alone):
                 assert torch.equal(batch.state_tensors()[name][world], sim.state_tensors()[name][0]), (name, world)
-    assert contacts > 5 and len(repeated(batch)) == len(forces)
+    assert contacts > 3 and len(repeated(batch)) == len(forces)
 
 
 def test_a_world_that_cannot_be_stepped_says_so() -> None:
