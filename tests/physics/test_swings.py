@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import torch
 
 import softwarp as sw
@@ -93,6 +94,24 @@ def swinging(most_swing: float, forces: tuple[float, ...]) -> sw.Simulation:
     )
     sim.control.rod_force[:, -1, 0] = torch.tensor(forces, dtype=torch.float64)
     return sim
+
+
+def turned(most_swing: float) -> float:
+    """By what a moment turns the tip against the next node in one step [rad], of a tube too heavy to go anywhere."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    tube = Tube([TubeSection(0.1)], radius=1e-3, youngs=1e8, density=1e9)
+    builder.add_telescope([tube], segments=8, lengths=(0.08,))
+    sim = sw.Simulation(builder.finalize(1, precision="float64"), dt=0.01, most_swing=most_swing)
+    sim.control.rod_force[:, -1, 3] = 2.5
+    sim.step()
+    return 2.0 * math.acos(float((sim.frame_pose[0, -1, 3:] * sim.frame_pose[0, -2, 3:]).sum()))
+
+
+def test_a_tip_that_turns_swings_its_segment() -> None:
+    """By half of its turn: what contacts hold in place, a step may spin all the same until it crumples."""
+    assert turned(math.inf) > 1.5
+    assert turned(0.5) == pytest.approx(1.0, rel=1e-3)
+    assert turned(0.3) == pytest.approx(0.6, rel=1e-3)
 
 
 def test_a_limit_changes_no_state_of_rest() -> None:

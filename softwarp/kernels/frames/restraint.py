@@ -15,6 +15,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
     world_fastest = variant.world_fastest
     module = variant.module("restraint")
 
+    @wp.func
+    def way_between(u: wp.array3d(dtype=real), a: int, b: int, scale: real, pack: int, lane: int):
+        """Square of the difference of two dofs' ways."""
+        square = real(0.0)
+        for c in range(3):
+            difference = scale * (u[pack, 3 * b + c, lane] - u[pack, 3 * a + c, lane])
+            square += difference * difference
+        return square
+
     @wp.kernel(module=module, enable_backward=False)
     def share_of_way(
         h: real,
@@ -34,8 +43,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Part of its way that a world goes: what swings no segment of its telescopes by more than ``most_swing``.
 
         A segment swings by the difference of the ways of its ends per length; one that is shorter than the line's
-        radius counts as that long. Velocities that are not finite are left for others to find. Told is the largest
-        swing on the whole way, too.
+        radius counts as that long. It swings against its ends by half of what they turn against each other, at least.
+        Velocities that are not finite are left for others to find. Told is the largest swing on the whole way, too.
         """
         pack, lane = wp.tid()
         largest = real(0.0)
@@ -44,13 +53,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             length = wp.max(plan_in[pack, wp.static(PLAN_ROWS) * item + 1, lane] / real(n), radius[item])
             for place in range(n):
                 frame = base_frame[item] + place
-                a = 3 * frame_dof[2 * frame]
-                b = 3 * frame_dof[2 * frame + 2]
-                square = real(0.0)
-                for c in range(3):
-                    difference = h * (u_in[pack, b + c, lane] - u_in[pack, a + c, lane])
-                    square += difference * difference
-                largest = wp.max(largest, square / (length * length))
+                swing = way_between(u_in, frame_dof[2 * frame], frame_dof[2 * frame + 2], h / length, pack, lane)
+                turn = way_between(u_in, frame_dof[2 * frame + 1], frame_dof[2 * frame + 3], h, pack, lane)
+                largest = wp.max(largest, wp.max(swing, real(0.25) * turn))
         share = real(1.0)
         if largest > most_swing * most_swing:
             share = most_swing / wp.sqrt(largest)
