@@ -34,7 +34,7 @@ def main() -> int:
     print("environments")
     for name in registry.names():
         entry = registry.spec(name)
-        print(f"  {name:<17}{entry.summary}  (env={entry.file_name}, Gymnasium {entry.gym_id})")
+        print(f"  {name:<22}{entry.summary}  (env={entry.file_name}, Gymnasium {entry.gym_id})")
     print("  one of your own:  env=my_module:MyClass, or a package that softwarp new makes")
     folders = ", ".join(map(str, config_folders()))
     print(f"\nsettings of softwarp train and softwarp plan, from {folders} and the environments")

@@ -46,12 +46,12 @@ def main(arguments: Sequence[str]) -> int:
         running = {pool.submit(compile_for, name, args.device, WORLDS[kind], folder): name for name in names}
         try:
             for done in as_completed(running):
-                print(f"{running[done]:<17}{done.result():6.1f} s", flush=True)
+                print(f"{running[done]:<22}{done.result():6.1f} s", flush=True)
         except KeyboardInterrupt:
             for process in active_children():  # in the middle of a kernel, which the next run compiles again
                 process.terminate()
             raise
-    print(f"{'all together':<17}{time.perf_counter() - start:6.1f} s; kernels are in {folder}")
+    print(f"{'all together':<22}{time.perf_counter() - start:6.1f} s; kernels are in {folder}")
     return 0
 
 

@@ -91,11 +91,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         idle_in: wp.array3d(dtype=wp.int32),
         # Workspace out
         near_out: wp.array3d(dtype=real),
+        reach_out: wp.array3d(dtype=real),
     ):
-        """No couple of an idle world is near, so that nothing is searched there and nothing found."""
+        """No couple of an idle world is near, so that nothing is searched there and nothing found.
+
+        One that is near here, but was not where the step begins, is measured within the reach that it has here.
+        """
         pack, couple, lane = wp.tid()
         if idle_in[pack, 0, lane] != 0:
             near_out[pack, couple, lane] = real(-1.0)
+        reach_out[pack, couple, lane] = wp.max(reach_out[pack, couple, lane], near_out[pack, couple, lane])
 
     @wp.kernel(module=module, enable_backward=False)
     def hold(

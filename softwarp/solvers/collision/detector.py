@@ -273,7 +273,7 @@ class Detector:
         a, c, motion = self.arrays, self.contacts, self._motion(x, pose, v, twist)
         laws = [pairs.distance.real, pairs.alarm.real, 0.0, 0.0]
         self._near(motion, laws, self.near)
-        self._launch(self.k_looks.quiet, self.couple_count, [c.idle.real], [self.near.real])
+        self._launch(self.k_looks.quiet, self.couple_count, [c.idle.real], [self.near.real, self.reach.real])
         self._search(motion, laws, self.near, -depth)
         c.first.zero()
         self._measure(motion)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from softwarp import notices
 from softwarp.envs import registry, tube_goals
 from softwarp.envs.options.concentric_tube_robot import ConcentricTubeRobotConfig
 from softwarp.envs.scenes.concentric_tube_robot import line_of, tube_of, vessel_of
@@ -121,15 +122,23 @@ def test_powers_make_small_actions_finer() -> None:
         ConcentricTubeRobotConfig(action_power=0.5)
 
 
-def test_margins_that_no_line_keeps_are_told_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wider than where lines begin: at once. Elsewhere: a quarter of the draws without one goal is enough."""
+def test_margins_that_no_line_keeps_are_told_soon(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Wider than where lines begin: at once. Elsewhere: a quarter of the draws without one goal is enough.
+
+    Commands tell meanwhile how far the search has come.
+    """
     with pytest.raises(ValueError, match=r"lines begin 4.13 mm from the wall, .* smaller goal_margin"):
         sought_goals(ConcentricTubeRobotConfig(goal_margin=0.5))
     config = ConcentricTubeRobotConfig()
     vessel, line = vessel_of(config), line_of(config)
     monkeypatch.setattr(tube_goals, "AT_ONCE", 100)
-    with pytest.raises(ValueError, match=r"only 0 lines of 1000 are 1 mm clear .* smaller goal_margin"):  # curved ends
+    monkeypatch.setattr(notices, "WAIT_SECONDS", -1.0)
+    refusal = r"only 0 lines of 1000 are 1 mm clear .* smaller goal_margin"  # curved ends
+    with notices.telling(), pytest.raises(ValueError, match=refusal):
         tube_goals.goal_table(vessel, line, config.max_length, clear=0.001, turn=2.0, depth=0.0899, count=1000)
+    assert "seeking goals: 0 of 1000 after 0 of at most 40 draws" in capsys.readouterr().err
 
 
 def test_another_seed_seeks_other_goals(monkeypatch: pytest.MonkeyPatch) -> None:
