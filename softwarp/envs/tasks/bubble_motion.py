@@ -32,7 +32,7 @@ The default mesh is one of linear tetrahedra, like SofaGym's, which costs truth:
 converged quadratic ones give at 100 kPa, by two thirds at 400 kPa. With quadratic ones between the same nodes
 (``element="p2", rotation="polar"``) 19 and 8 % are missing, on ``mesh="graded"`` 2.3 and 0.8 %, in some 280 times the
 time of the default. ``fidelity="accurate"`` moves that board in 48 modes: within 2.7 % of the converged rise at 100
-kPa, 1.6 % at 200, 0.2 % at 400, in some 3.8 times the time of the default. A ball under random actions then is 2.8 and
+kPa, 1.6 % at 200, 0.2 % at 400, in some 3.2 times the time of the default. A ball under random actions then is 2.8 and
 4.4 mm on average from where the board node by node has it, with the default 8.5 and 10 mm (two episodes of 80 steps).
 """
 

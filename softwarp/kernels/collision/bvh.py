@@ -26,23 +26,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
     types = geometry.structures(real)
     Scene = types.Scene
 
-    @wp.func
-    def place(
-        scene: Scene, x_in: wp.array2d(dtype=S), pose_in: wp.array2d(dtype=S), w: int, point: int, component: int
-    ):
-        """One coordinate of a node or of a frame's origin."""
-        index = scene.point_index[point]
-        value = S(real(0.0))
-        if scene.point_kind[point] == wp.static(Carrier.NODE):
-            value = x_in[w, 3 * index + component]
-        else:
-            value = pose_in[w, 7 * index + component]
-        return value
-
     @wp.kernel(module=module, enable_backward=False)
     def refit(
         # Model
-        scene: Scene,
+        tree_skip: wp.array(dtype=wp.int32),
+        corner_start: wp.array(dtype=wp.int32),
+        corner_row: wp.array(dtype=wp.int32),
+        corner_radius: wp.array(dtype=real),
         task_start: wp.array(dtype=wp.int32),
         task_node: wp.array(dtype=wp.int32),
         first_task: int,
@@ -60,60 +50,47 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for k in range(task_start[task], task_start[task + 1]):
             node = task_node[k]
             row = 6 * node
-            first = scene.tree_first[node]
-            for c in range(3):
-                low = S(real(UNBOUNDED))
-                high = S(real(-UNBOUNDED))
-                if first >= 0:
-                    for j in range(first, scene.tree_last[node]):
-                        face = scene.tree_face[j]
-                        radius = S(scene.face_radius[face])
-                        for corner in range(3):
-                            point = scene.face_corner[face, corner]
-                            if point >= 0:
-                                p = place(scene, x_in, pose_in, w, point, c)
-                                low = wp.min(low, p - radius)
-                                high = wp.max(high, p + radius)
-                else:
-                    left = 6 * (node + 1)
-                    right = 6 * scene.tree_skip[node + 1]
-                    low = wp.min(tree_box_out[w, left + c], tree_box_out[w, right + c])
-                    high = wp.max(tree_box_out[w, left + 3 + c], tree_box_out[w, right + 3 + c])
-                tree_box_out[w, row + c] = low
-                tree_box_out[w, row + 3 + c] = high
-
-    @wp.func
-    def part_bounds(
-        scene: Scene,
-        x_in: wp.array2d(dtype=S),
-        pose_in: wp.array2d(dtype=S),
-        v_in: wp.array2d(dtype=S),
-        twist_in: wp.array2d(dtype=S),
-        w: int,
-        begin: int,
-        end: int,
-        step: int,
-        c: int,
-    ):
-        """Bounds of one coordinate and of its velocity over every ``step``-th point."""
-        low = S(real(UNBOUNDED))
-        high = S(real(-UNBOUNDED))
-        slowest = S(real(UNBOUNDED))
-        fastest = S(real(-UNBOUNDED))
-        for point in range(begin, end, step):
-            p = place(scene, x_in, pose_in, w, point, c)
-            radius = S(scene.point_radius[point])
-            low = wp.min(low, p - radius)
-            high = wp.max(high, p + radius)
-            index = scene.point_index[point]
-            v = S(real(0.0))
-            if scene.point_kind[point] == wp.static(Carrier.NODE):
-                v = v_in[w, 3 * index + c]
+            begin = corner_start[node]
+            end = corner_start[node + 1]
+            if begin < end:
+                low_x = S(real(UNBOUNDED))
+                low_y = S(real(UNBOUNDED))
+                low_z = S(real(UNBOUNDED))
+                high_x = S(real(-UNBOUNDED))
+                high_y = S(real(-UNBOUNDED))
+                high_z = S(real(-UNBOUNDED))
+                for j in range(begin, end):
+                    at = corner_row[j]
+                    x = S(real(0.0))
+                    y = S(real(0.0))
+                    z = S(real(0.0))
+                    if at >= 0:
+                        x = x_in[w, at]
+                        y = x_in[w, at + 1]
+                        z = x_in[w, at + 2]
+                    else:
+                        x = pose_in[w, -1 - at]
+                        y = pose_in[w, -at]
+                        z = pose_in[w, 1 - at]
+                    radius = S(corner_radius[j])
+                    low_x = wp.min(low_x, x - radius)
+                    low_y = wp.min(low_y, y - radius)
+                    low_z = wp.min(low_z, z - radius)
+                    high_x = wp.max(high_x, x + radius)
+                    high_y = wp.max(high_y, y + radius)
+                    high_z = wp.max(high_z, z + radius)
+                tree_box_out[w, row] = low_x
+                tree_box_out[w, row + 1] = low_y
+                tree_box_out[w, row + 2] = low_z
+                tree_box_out[w, row + 3] = high_x
+                tree_box_out[w, row + 4] = high_y
+                tree_box_out[w, row + 5] = high_z
             else:
-                v = twist_in[w, 6 * index + c]
-            slowest = wp.min(slowest, v)
-            fastest = wp.max(fastest, v)
-        return low, high, slowest, fastest
+                left = 6 * (node + 1)
+                right = 6 * tree_skip[node + 1]
+                for c in range(3):
+                    tree_box_out[w, row + c] = wp.min(tree_box_out[w, left + c], tree_box_out[w, right + c])
+                    tree_box_out[w, row + 3 + c] = wp.max(tree_box_out[w, left + 3 + c], tree_box_out[w, right + 3 + c])
 
     @wp.kernel(module=module, enable_backward=False)
     def embed(
@@ -147,6 +124,39 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         total += x_in[w, 3 * node + c] * carrier_weight[item - node_count, k]
                     x_out[w, 3 * item + c] = total
 
+    @wp.struct
+    class Bounds:
+        low: S
+        high: S
+        slowest: S
+        fastest: S
+
+    @wp.func
+    def bounds_of_none():
+        b = Bounds()
+        b.low = S(real(UNBOUNDED))
+        b.high = S(real(-UNBOUNDED))
+        b.slowest = S(real(UNBOUNDED))
+        b.fastest = S(real(-UNBOUNDED))
+        return b
+
+    @wp.func
+    def with_point(b: Bounds, p: S, v: S, radius: S):
+        """Bounds of one coordinate and of its velocity, with those of one more point."""
+        wider = Bounds()
+        wider.low = wp.min(b.low, p - radius)
+        wider.high = wp.max(b.high, p + radius)
+        wider.slowest = wp.min(b.slowest, v)
+        wider.fastest = wp.max(b.fastest, v)
+        return wider
+
+    @wp.func
+    def put_bounds(b: Bounds, part_out: wp.array2d(dtype=S), w: int, row: int):
+        part_out[w, row] = b.low
+        part_out[w, row + 1] = b.high
+        part_out[w, row + 2] = b.slowest
+        part_out[w, row + 3] = b.fastest
+
     @wp.kernel(module=module, enable_backward=False)
     def spread_part(
         # Model
@@ -168,16 +178,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
             task, w = wp.tid()
         item = task // parts
         if object_frame[item] == wp.static(SUM_OF_POINTS):
-            begin = object_point[item, 0] + task % parts
-            for c in range(3):
-                low, high, slowest, fastest = part_bounds(
-                    scene, x_in, pose_in, v_in, twist_in, w, begin, object_point[item, 1], parts, c
-                )
-                k = 12 * task + 4 * c
-                part_out[w, k] = low
-                part_out[w, k + 1] = high
-                part_out[w, k + 2] = slowest
-                part_out[w, k + 3] = fastest
+            x = bounds_of_none()
+            y = bounds_of_none()
+            z = bounds_of_none()
+            for point in range(object_point[item, 0] + task % parts, object_point[item, 1], parts):
+                index = scene.point_index[point]
+                radius = S(scene.point_radius[point])
+                if scene.point_kind[point] == wp.static(Carrier.NODE):
+                    at = 3 * index
+                    x = with_point(x, x_in[w, at], v_in[w, at], radius)
+                    y = with_point(y, x_in[w, at + 1], v_in[w, at + 1], radius)
+                    z = with_point(z, x_in[w, at + 2], v_in[w, at + 2], radius)
+                else:
+                    at = 7 * index
+                    speed = 6 * index
+                    x = with_point(x, pose_in[w, at], twist_in[w, speed], radius)
+                    y = with_point(y, pose_in[w, at + 1], twist_in[w, speed + 1], radius)
+                    z = with_point(z, pose_in[w, at + 2], twist_in[w, speed + 2], radius)
+            put_bounds(x, part_out, w, 12 * task)
+            put_bounds(y, part_out, w, 12 * task + 4)
+            put_bounds(z, part_out, w, 12 * task + 8)
 
     @wp.kernel(module=module, enable_backward=False)
     def spread(

@@ -341,13 +341,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         balance_out: wp.array2d(dtype=S),
     ):
-        """f_ext - f_int of one listed node, without its weight."""
-        w, i = wp.tid()
+        """f_ext - f_int of one listed node, without its weight; on a CPU of all."""
+        w, part = wp.tid()
+        first = int(0)
+        last = node.shape[0]
         if wp.static(world_fastest):
-            i, w = wp.tid()
-        row = 3 * node[i]
-        for c in range(3):
-            balance_out[w, 3 * i + c] = node_external_in[w, row + c] - node_internal_in[w, row + c]
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        for i in range(first, last):
+            row = 3 * node[i]
+            for c in range(3):
+                balance_out[w, 3 * i + c] = node_external_in[w, row + c] - node_internal_in[w, row + c]
 
     @wp.kernel(module=module, enable_backward=False)
     def narrow(

@@ -71,13 +71,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             item, w = wp.tid()
         p = first_point + item
-        for c in range(3):
-            y = S(point_anchor[p, c])
-            for k in range(4):
-                node = point_node[p, k]
-                if node >= 0:
-                    y += node_x_in[w, 3 * node + c] * point_weight[p, k]
-            point_x_out[w, 3 * p + c] = y
+        x = S(point_anchor[p, 0])
+        y = S(point_anchor[p, 1])
+        z = S(point_anchor[p, 2])
+        for k in range(4):
+            node = point_node[p, k]
+            if node >= 0:
+                weight = point_weight[p, k]
+                x += node_x_in[w, 3 * node] * weight
+                y += node_x_in[w, 3 * node + 1] * weight
+                z += node_x_in[w, 3 * node + 2] * weight
+        point_x_out[w, 3 * p] = x
+        point_x_out[w, 3 * p + 1] = y
+        point_x_out[w, 3 * p + 2] = z
 
     @wp.kernel(module=module, enable_backward=False)
     def cavity_gradient(

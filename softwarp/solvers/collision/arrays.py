@@ -28,6 +28,7 @@ class SceneArrays:
         object_frame, object_point, object_centre, object_extent: Objects.
         object_round: Whether it is a ball about its frame's origin.
         moving_nodes: Tree nodes that are refitted in every step.
+        corner_start, corner_row, corner_radius: Corners of the leaves among them, ``_corners``.
         task_start, task_node: Tree nodes by thread.
         tasks: Threads of the first launch of a refit, and of the second.
         chunk_key, chunk_couple: First key and couple of every chunk.
@@ -44,6 +45,9 @@ class SceneArrays:
     object_centre: wp.array
     object_extent: wp.array
     moving_nodes: int
+    corner_start: wp.array
+    corner_row: wp.array
+    corner_radius: wp.array
     task_start: wp.array
     task_node: wp.array
     tasks: tuple[int, int]
@@ -100,7 +104,7 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
     packed.fan_start, packed.fan = put(start, wp.int32), put(fan, wp.int32)
     packed.couple = put(scene.couple_table(patient=patient), wp.int32)
     packed.couple_clear = put([scene.entities[c.b].clear for c in scene.couples] or [0.0], variant.real)
-    moving, tasks = _trees(scene, packed, put)
+    moving, corners, tasks = _trees(scene, packed, put)
     e, chunks = scene.entities, _chunks(scene, put)
     tracked = np.flatnonzero(scene.couple_table()[:, CoupleColumn.TRACKED])
     return SceneArrays(
@@ -110,6 +114,7 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
         put([o.centre for o in e] or [np.zeros(3)], t.vec3),
         put([o.extent for o in e] or [np.zeros(3)], t.vec3),
         moving,
+        *corners,
         put(np.cumsum([0, *(len(task) for group in tasks for task in group)]), wp.int32),
         put([node for group in tasks for task in group for node in task] or [0], wp.int32),
         (len(tasks[0]), len(tasks[1])),
@@ -121,7 +126,9 @@ def pack(scene: CollisionScene, variant: Variant, device: Any, *, patient: bool 
     )
 
 
-def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple[list[list[int]], list[list[int]]]]:
+def _trees(
+    scene: CollisionScene, packed: Any, put: _Packer
+) -> tuple[int, tuple[wp.array, wp.array, wp.array], tuple[list[list[int]], list[list[int]]]]:
     """Trees over the faces of those targets that couples search; those that move come first."""
     trees = Trees.empty()
     against = [scene.entities[couple.b] for couple in scene.couples]
@@ -146,13 +153,36 @@ def _trees(scene: CollisionScene, packed: Any, put: _Packer) -> tuple[int, tuple
 
     moving = build([target for target in searched if kinds[target] in (Target.SOFT, Target.CHAIN)], "rest")
     moving_nodes = len(trees.skip)
+    corners = _corners(trees, scene, put)
     build([target for target in searched if kinds[target] == Target.MESH], "local")
     packed.target_tree = put(root_of, wp.int32)
     packed.tree_skip, packed.tree_face = put(trees.skip or [0], wp.int32), put(trees.face or [0], wp.int32)
     packed.tree_first, packed.tree_last = put(trees.first or [-1], wp.int32), put(trees.last or [-1], wp.int32)
     packed.tree_box = put(np.array(trees.box) if trees.box else np.zeros((1, 6)), put.variant.real)
     packed.moving_nodes = moving_nodes
-    return moving_nodes, trees.refit_tasks(moving)
+    return moving_nodes, corners, trees.refit_tasks(moving)
+
+
+def _corners(trees: Trees, scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp.array]:
+    """Corners of the faces of every leaf, each once: first one of every tree node, rows and radii.
+
+    A row is that of a node's x, or -1 minus that of a frame's; the radius is the largest of the leaf's faces there.
+    Inner nodes have none.
+    """
+    corner = scene.faces.array("corner", np.int64, (3,))
+    radius = scene.faces.array("radius", np.float64)
+    kind, index = scene.points.array("kind", np.int32), scene.points.array("index", np.int64)
+    row = np.where(kind == Carrier.NODE, 3 * index, -1 - 7 * index)
+    start, rows, radii = [0], list[int](), list[float]()
+    for first, last in zip(trees.first, trees.last, strict=True):
+        reach: dict[int, float] = {}
+        for face in trees.face[first:last] if first >= 0 else []:
+            for point in corner[face][corner[face] >= 0]:
+                reach[int(row[point])] = max(reach.get(int(row[point]), 0.0), float(radius[face]))
+        rows += list(reach)
+        radii += list(reach.values())
+        start.append(len(rows))
+    return put(start, wp.int32), put(rows or [0], wp.int32), put(radii or [0.0], put.variant.real)
 
 
 def _partners(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array]:

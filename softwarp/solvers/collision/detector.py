@@ -361,7 +361,8 @@ class Detector:
             inputs = [a.object_frame, parts, self.spread.S]
             self._launch_elements(self.k_tree.spread, self.object_count, inputs, [self.box.S, self.velocity.S])
         for first, count in ((0, a.tasks[0]), (a.tasks[0], a.tasks[1])):
-            inputs = [self.scene, a.task_start, a.task_node, first, x.S, pose.S]
+            inputs = [self.scene.tree_skip, a.corner_start, a.corner_row, a.corner_radius]
+            inputs += [a.task_start, a.task_node, first, x.S, pose.S]
             self._launch_elements(self.k_tree.refit, count, inputs, [self.tree_box.S])
         return motion
 

@@ -116,7 +116,7 @@ class ReductionTerm(Term):
         inputs = [m.wide_mode, m.wide_body, m.body_number, m.heft, i["density"].S, i["gravity"].S]
         s.each(self.k.mode_weight, m.wide_count, inputs, [w.wide_force.S])
         inputs = [m.node, w.node_internal.S, w.node_external.S]
-        s.each(self.k.node_balance, int(m.node.size), inputs, [w.listed_force.S])
+        s.each(self.k.node_balance, s.variant.parts(int(m.node.size)), inputs, [w.listed_force.S])
         if self.frames is not None:
             self.frames.turn_loads()
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]

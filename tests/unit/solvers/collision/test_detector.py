@@ -396,6 +396,32 @@ def test_boxes_of_a_refitted_tree_hold_their_faces(rng):
         np.testing.assert_array_equal(boxes[node], np.concatenate([points.min(axis=0), points.max(axis=0)]))
 
 
+def test_boxes_of_a_bent_rod_hold_its_segments(rng):
+    """Segments of a rod hang on frames and have radii of their own; a box holds each grown by its own."""
+    count = 40
+    pose = np.zeros((2 * count, 7))
+    pose[:, 6] = 1.0
+    pose[:, 0] = 0.02 * np.tile(np.arange(count), 2)
+    pose[count:, 2] = 0.5
+    radius = rng.uniform(1e-3, 5e-3, count - 1)
+    scene = CollisionBuilder()
+    rods = [scene.add_rod(np.arange(k, k + count), radius, pose[k : k + count, :3]) for k in (0, count)]
+    scene.pair(*rods)
+    probe = Probe(scene, pose=pose)
+    probe.pose[0, :, :3] += 0.01 * rng.standard_normal((2 * count, 3))
+    probe.find()
+    packed = probe.detector.scene
+    skip, first, last, face = (getattr(packed, f"tree_{n}").numpy() for n in ("skip", "first", "last", "face"))
+    frames = packed.point_index.numpy()[packed.face_corner.numpy()[:, :2]]
+    boxes = probe.detector.tree_box.real.numpy()[0, :, 0].reshape(-1, 6)
+    assert len(skip) > 8
+    for node in range(len(skip)):
+        below = np.concatenate([face[first[m] : last[m]] for m in range(node, skip[node]) if first[m] >= 0])
+        ends, grown = probe.pose[0, frames[below], :3], packed.face_radius.numpy()[below, None, None]
+        box = [(ends - grown).min(axis=(0, 1)), (ends + grown).max(axis=(0, 1))]
+        np.testing.assert_array_equal(boxes[node], np.concatenate(box))
+
+
 def test_tree_holds_every_face_once():
     """Leaves partition the faces; skip leads behind the subtree."""
     rng = np.random.default_rng(1)
