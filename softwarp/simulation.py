@@ -456,8 +456,7 @@ class Simulation(
 
         Args:
             more_sides: Right-hand sides for rows of the caller, besides those of the model.
-            exact: Make room for the exact tangent, as ``solve_static`` does; for soft bodies with cables and prescribed
-                pressures.
+            exact: Make room for the exact tangent, as ``solve_static`` does; for soft bodies with cables and chambers.
 
         Returns:
             Worlds of the batch and their system.
@@ -467,8 +466,7 @@ class Simulation(
         """
         if exact and not self._systems[0].has_exact_tangent:
             raise ValueError(
-                "exact systems know soft bodies, cables and prescribed pressures; this scene has other parts, "
-                "do without exact"
+                "exact systems know soft bodies, cables and chambers; this scene has other parts, do without exact"
             )
         options, model, index = self.options, self.model, None
         if exact:

@@ -157,6 +157,21 @@ class Statics:
             ValueError: For a limit outside its range; the message names it.
             MemoryError: If there is no room on the device for the workspace that the solve needs besides.
         """
+        follows = self._systems[0].follows_paths
+        return self._settle(tolerance, max_iterations, max_seconds, follows=follows)
+
+    @alone
+    def follow_static(self, tolerance: float | None = None, max_iterations: int = 200) -> StaticResult:
+        """``solve_static`` that follows paths with chambers and cables that stretch, too.
+
+        Faster and more exact from near equilibria, as of gradients. Arguments, result and errors are those of
+        ``solve_static``, with the tolerances of paths.
+        """
+        return self._settle(tolerance, max_iterations, None, follows=self._systems[0].has_exact_tangent)
+
+    def _settle(
+        self, tolerance: float | None, max_iterations: int, max_seconds: float | None, *, follows: bool
+    ) -> StaticResult:
         if tolerance is not None:
             checks.number(tolerance, "solve_static: tolerance", above=0.0)
         if max_seconds is not None:
@@ -165,7 +180,7 @@ class Statics:
         watch = _Watch(self.model.num_worlds, max_seconds)
         everything = np.ones(self.model.num_worlds, dtype=bool)
         try:
-            if not self._systems[0].follows_paths:
+            if not follows:
                 found = self._relax(tolerance, max_iterations, watch, everything)
             else:
                 found = self._follow(tolerance, max_iterations, watch)

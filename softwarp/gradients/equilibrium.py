@@ -37,6 +37,7 @@ class Pose:
     Attributes:
         node_x: Positions of nodes [m], (world, node, 3).
         cable_tension: Tensions [N], (world, cable).
+        cavity_pressure: Pressures of chambers [Pa], (world, chamber).
         marker_x: Positions of markers [m], (world, marker, 3).
         rod_x: Positions of the nodes of rods [m], (world, rod node, 3).
         rod_q: Their orientations, unit quaternions (x, y, z, w), (world, rod node, 4).
@@ -45,6 +46,7 @@ class Pose:
 
     node_x: torch.Tensor
     cable_tension: torch.Tensor
+    cavity_pressure: torch.Tensor
     marker_x: torch.Tensor
     rod_x: torch.Tensor
     rod_q: torch.Tensor
@@ -56,17 +58,17 @@ class Equilibrium:
 
     A solve starts from the state of the simulation, which it leaves as it is. The backward pass costs one
     factorisation, whatever the number of unknowns, and has the exact tangent: its gradients are those of the
-    equilibrium, not of the way to it.
+    equilibrium, not of the way to it. Further backward passes of the last pose have that factor, too.
 
     Rods and rigid bodies are brought to rest by Newton's method with the exact tangent, where ``solve_static`` takes
     steps: first by steps of the simulation, damped as it is, which end in the equilibrium that the motion would.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers under pressure control; or rods and
-            rigid bodies, with cables under force control.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers; or rods and rigid bodies, with
+            cables under force control.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
-        warm: Of rods and rigid bodies, whether a solve starts from the last one's poses, as of fits, whose parameters
-            change little by little; a result depends on those before it within the tolerance then.
+        warm: Whether a solve starts from the last one's poses, as of fits, whose parameters change little by little; a
+            result depends on those before it within the tolerance then.
 
     Raises:
         ValueError: If a part of the scene has no gradient; the message names it and the way out.
@@ -88,8 +90,6 @@ class Equilibrium:
                 raise ValueError("gradients.Equilibrium: rods and rigid bodies have no rest shape; leave rest=True out")
             self.frames = FrameWorlds(sim)
             return
-        if warm:
-            raise ValueError("gradients.Equilibrium: warm is for rods and rigid bodies; leave warm=True out")
         arrays = create(Gradients, model)
         self.gradients = interop.views(arrays, model)
         index, systems = AdjointIndex.of(model), sim.make_systems(0, exact=True)
@@ -98,7 +98,11 @@ class Equilibrium:
             for each, system in systems
         ]
         workers = Workers(len(pulls)) if len(pulls) > 1 else None
-        self._pull = Replayed(model.device, [pull.step for pull in pulls], workers)
+        self._prepare, self._pull = (
+            Replayed(model.device, [getattr(pull, name) for pull in pulls], workers) for name in ("prepare", "pull")
+        )
+        self._last: tuple[torch.Tensor, ...] | None = None  # positions, tensions and pressures
+        self._solved, self._prepared = 0, 0  # numbers of equilibria: the last, and the one whose tangent is there
         self.shape = RestShape(model, sim.node_x) if rest else None
 
     def __call__(
@@ -113,8 +117,9 @@ class Equilibrium:
 
         Args:
             controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``traction`` [Pa],
-                ``cable_displacement`` [m], ``cable_tension`` [N] and ``cavity_pressure`` [Pa], shaped as in
-                ``sim.control`` or so that they broadcast to that; those of the simulation where left out.
+                ``cable_displacement`` [m], ``cable_tension`` [N], ``cavity_pressure`` [Pa], ``cavity_volume`` and
+                ``cavity_gas`` [m^3], shaped as in ``sim.control`` or so that they broadcast to that; those of the
+                simulation where left out.
             parameters: ``youngs``, ``nu``, ``density``, ``gravity``, ``law_parameter``, ``cable_stiffness``,
                 ``rod_youngs``, ``rod_nu``, ``rod_density`` and ``body_mass``, likewise of ``sim.params``. With ``rest``
                 also ``rest_x`` [m], the rest positions of the model, (node, 3).
@@ -141,9 +146,9 @@ class Equilibrium:
         limits = {"tolerance": tolerance, "max_iterations": max_iterations}
         if self.frames is not None:
             return self._of_frames(self.frames, given, limits)
-        x, tension = _Rest.apply(self, tuple(given), limits, *given.values())
+        x, tension, pressure = _Rest.apply(self, tuple(given), limits, *given.values())
         none = x.new_zeros((len(x), 0, 7))
-        return Pose(x, tension, self._markers(x), none[..., :3], none[..., 3:], none)
+        return Pose(x, tension, pressure, self._markers(x), none[..., :3], none[..., 3:], none)
 
     def _of_frames(self, worlds: FrameWorlds, given: dict[str, torch.Tensor], limits: dict[str, Any]) -> Pose:
         """Rods and rigid bodies at rest, with what moves with others."""
@@ -158,7 +163,10 @@ class Equilibrium:
         model = worlds.model
         rods = pose[:, model.rigid_count : model.rigid_count + model.rod_node_count]
         x = worlds.state["node_x"].clone()
-        return Pose(x, tension, self._markers(x, pose), rods[..., :3], rods[..., 3:], pose[:, : model.rigid_count])
+        none = x.new_zeros((len(x), 0))
+        return Pose(
+            x, tension, none, self._markers(x, pose), rods[..., :3], rods[..., 3:], pose[:, : model.rigid_count]
+        )
 
     def _commands(self) -> tuple[tuple[str, ...], Tensors]:
         """Names of commands, and what each must look like."""
@@ -186,8 +194,41 @@ class Equilibrium:
             else:
                 groups[group][own].copy_(value)
 
-    def pull(self) -> None:
-        """Gradients by the present state, an equilibrium, become those by commands and parameters."""
+    def start(self) -> None:
+        """Put the last equilibrium in place, where there is one and solves start from it."""
+        if self.warm and self._last is not None:
+            self._put(self._last)
+
+    def settle(self, limits: dict[str, Any]) -> tuple[int, tuple[torch.Tensor, ...]]:
+        """Bring the worlds to rest; the number of this equilibrium, and positions, tensions and pressures.
+
+        Raises:
+            Diverged: If a world is not at rest.
+        """
+        sim = self.sim
+        found = sim.follow_static(**limits)
+        self.check(found.converged, sim.compression)
+        self._last = sim.node_x.clone(), sim.cable_tension.clone(), sim.cavity_pressure.clone()
+        self._solved += 1
+        return self._solved, self._last
+
+    def _put(self, held: tuple[torch.Tensor, ...]) -> None:
+        sim = self.sim
+        for view, value in zip((sim.node_x, sim.cable_tension, sim.cavity_pressure), held, strict=True):
+            view.copy_(value)
+        sim.node_v.zero_()
+
+    def pull(self, number: int, held: tuple[torch.Tensor, ...]) -> None:
+        """Gradients by an equilibrium become those by commands and parameters, which are in place.
+
+        Args:
+            number: Of the equilibrium; the tangent of the last one that was asked for is kept.
+            held: Its positions, tensions and pressures.
+        """
+        self._put(held)
+        if number != self._prepared:
+            self._prepare()
+            self._prepared = number
         self._pull()
 
     def check(self, converged: torch.Tensor, compression: torch.Tensor) -> None:
@@ -211,24 +252,25 @@ class _Rest(torch.autograd.Function):
     def forward(
         ctx: Any, owner: Equilibrium, names: tuple[str, ...], limits: dict[str, Any], *tensors: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Positions and tensions."""
+        """Positions, tensions and pressures."""
         sim = owner.sim
         before = sim.snapshot()
         try:
             owner.place(dict(zip(names, tensors, strict=True)))
             held = [*sim.control.tensors().values(), *sim.params.tensors().values()]
             commands = [view.clone() for view in held]
-            found = sim.solve_static(**limits)
-            owner.check(found.converged, sim.compression)
-            x, tension, pressure = sim.node_x.clone(), sim.cable_tension.clone(), sim.cavity_pressure.clone()
+            owner.start()
+            number, found = owner.settle(limits)
         finally:
             sim.restore(before)
-        ctx.owner, ctx.names = owner, names
-        ctx.save_for_backward(x, tension, pressure, *commands)
-        return x, tension
+        ctx.owner, ctx.names, ctx.number = owner, names, number
+        ctx.save_for_backward(*found, *commands)
+        return found
 
     @staticmethod
-    def backward(ctx: Any, by_x: torch.Tensor, by_tension: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(
+        ctx: Any, by_x: torch.Tensor, by_tension: torch.Tensor, by_pressure: torch.Tensor
+    ) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
         owner, sim, gradients = ctx.owner, ctx.owner.sim, ctx.owner.gradients
         x, tension, pressure, *commands = ctx.saved_tensors
@@ -237,15 +279,12 @@ class _Rest(torch.autograd.Function):
             held = [*sim.control.tensors().values(), *sim.params.tensors().values()]
             for view, value in zip(held, commands, strict=True):
                 view.copy_(value)
-            sim.node_x.copy_(x)
-            sim.node_v.zero_()
-            sim.cable_tension.copy_(tension)
-            sim.cavity_pressure.copy_(pressure)
             for view in gradients.values():
                 view.zero_()
             gradients["node_x"].copy_(by_x)
             gradients["cable_tension"].copy_(by_tension)
-            owner.pull()
+            gradients["cavity_pressure"].copy_(by_pressure)
+            owner.pull(ctx.number, (x, tension, pressure))
         finally:
             sim.restore(before)
         if owner.shape is not None:

@@ -56,7 +56,7 @@ def require_static_gradient(sim: Simulation) -> None:
     if sim.model.has_moving_frames:
         for found in _resting_frames(sim):
             raise ValueError(f"gradients.Equilibrium: {found}; take a Rollout with damping that comes to rest")
-    for found in itertools.chain(_parts(sim.model), _chambers(sim.model)):
+    for found in _parts(sim.model):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
         told = "equilibria with contact have no gradient yet"

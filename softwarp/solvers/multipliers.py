@@ -73,11 +73,6 @@ class StaticRows:
         inputs = [w.displacement.S, w.target.S, w.compliance.S, w.floor.S, w.ceiling.S, w.multiplier.S]
         s.each(self.k.row_gap, self.count, inputs, [w.gap.S])
 
-    def clamp(self) -> None:
-        """Bring the multipliers within the bounds of new commands."""
-        s, w = self.shard, self.shard.work
-        s.each(self.k.clamp_rows, self.count, [w.lower_bound.S, w.upper_bound.S], [w.multiplier.S])
-
 
 class Multipliers:
     """Multipliers in a linear solve without any rows; with rows, one of the classes below.

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from softwarp.kernels.rows import active_set
 from softwarp.kernels.step import newton, statics
+from softwarp.model.codes import CavityControl
+from softwarp.model.fields import real_of
+from softwarp.model.model import Model
 from softwarp.solvers.linear.lu import LUSolver
 from softwarp.solvers.newton_control import ROUNDING_FLOAT64, rounding_force
 from softwarp.solvers.system import System
 
 STEP_BOUND = 0.05  # of the scene's extent: how far a node may move in one iteration
 ROUNDING_FLOAT32 = 5.0e-3  # relative imbalance that coordinates of this precision can cause; the distance decides
+FLAT = 1.0e-3  # of the scene's extent: least depth of a chamber against which its volume's error is measured
 DISTANCE = 5.0e-4  # of the scene's extent: length of a Newton step below which a world may count as converged
 
 
@@ -42,7 +47,8 @@ class QuasiStatic:
         allocate, dofs = self.shard.rows, self.shard.dof_rows
         self.a_upper = allocate(9 * self.shard.blocks)
         self.start_imbalance, self.reference = allocate(dofs), allocate(dofs)
-        self.start_displacement, self.start_multiplier = allocate(count), allocate(count)
+        self.start_value, self.start_multiplier = allocate(count), allocate(count)
+        self.imposed, self.length = _row_kinds(model), _row_lengths(model)
         self.reference_multiplier, self.value = allocate(count), allocate(count)
         self.compliance, self.matrix, self.is_active = allocate(count * count), allocate(count * count), allocate(count)
         self.contact = allocate(1)
@@ -54,11 +60,11 @@ class QuasiStatic:
         system.scale(0.0)
         s.each_real(self.k.begin, None, [], [w.control.real])
         self._load()
-        system.rows.clamp()
+        inputs = [self.imposed, w.displacement.real, w.compliance.real, w.lower_bound.real, w.upper_bound.real]
+        s.each_real(self.k.start_rows, system.rows.count, inputs, [w.multiplier.real, self.start_value.real])
         system.imbalance(1.0, inertia=False)
         inputs = [system.model.dof_count, 0, system.linear.y.S, self.value.S]
         s.each(self.k_rows.combine, s.dof_rows, inputs, [self.start_imbalance.S])
-        self.start_displacement.copy_from(w.displacement)
         self.start_multiplier.copy_from(w.multiplier)
         self.reference_multiplier.copy_from(w.multiplier)
         self.reference.zero()
@@ -82,13 +88,12 @@ class QuasiStatic:
         """Merit of the present iterate at its point of the path."""
         system, s, w, count = self.system, self.shard, self.work, self.system.rows.count
         self._load()
-        inputs = [system.model.cable_force_control, w.control.real]
-        inputs += [self.start_displacement.real, self.start_multiplier.real]
-        s.each_real(self.k.path_command, count, inputs, [w.target.real, w.upper_bound.real])
+        inputs = [self.imposed, w.control.real, self.start_value.real, self.start_multiplier.real]
+        s.each_real(self.k.path_command, count, inputs, [w.target.real, w.lower_bound.real, w.upper_bound.real])
         s.each_real(self.k.path_load, s.dof_rows, [w.control.real, self.start_imbalance.real], [w.b.real])
         system.imbalance(1.0, inertia=False)
         system.rows.measure_gaps()
-        inputs = [count, system.model.cable_rest_length, w.norm.real, w.gap.real]
+        inputs = [count, self.length, w.norm.real, w.gap.real]
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
         s.each_real(self.k.measure, None, inputs, [w.control.real])
 
@@ -147,6 +152,7 @@ class QuasiStatic:
         self.lu.solve(1 + count)
         if count:
             self.measure_compliance()
+            s.each(self.k_rows.add_own, count, [count, w.compliance.S], [self.compliance.S])
             inputs = [count, self.epsilon, model.extent, self.compliance.real, w.gap.real]
             inputs += [w.lower_bound.real, w.upper_bound.real, w.multiplier.real]
             outputs = [self.is_active.real, self.matrix.real, self.value.real, self.contact.real]
@@ -168,3 +174,21 @@ class QuasiStatic:
         s.each_real(self.k.advance, s.dof_rows, inputs, [w.dof_v.real, self.reference.real])
         inputs = [w.control.real, self.value.real, False]
         s.each_real(self.k.advance, self.system.rows.count, inputs, [w.multiplier.real, self.reference_multiplier.real])
+
+
+def _row_kinds(model: Model) -> wp.array:
+    """What the commands of rows impose: ``FREE``, ``PULLED`` or ``PRESSED``, (row,)."""
+    kinds = np.where(model.cable_force_control.numpy() != 0, statics.PULLED, statics.FREE)
+    if model.cavities is not None:
+        is_pressed = model.cavities.cavity_control.numpy() == CavityControl.PRESSURE
+        kinds = np.concatenate([kinds, np.where(is_pressed, statics.PRESSED, statics.FREE)])
+    return wp.array(kinds, dtype=wp.int32, device=model.device)
+
+
+def _row_lengths(model: Model) -> wp.array:
+    """Against which gaps of rows are measured [m], (row,): lengths of cables, volumes of chambers per surface."""
+    lengths = model.cable_rest_length.numpy()
+    if model.cavities is not None:
+        depths = model.cavities.cavity_rest_volume.numpy() / model.cavities.cavity_area.numpy()
+        lengths = np.concatenate([lengths, np.maximum(depths, FLAT * model.extent)])
+    return wp.array(lengths, dtype=real_of(model.precision), device=model.device)

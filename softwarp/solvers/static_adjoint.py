@@ -37,8 +37,12 @@ class StaticAdjoint(StepAdjoint):
         self.a_upper = self.shard.rows(9 * self.shard.blocks)
         self.k_active = active_set.kernels(system.variant)
 
-    def step(self) -> None:
-        """Gradients by the equilibrium become those by what it follows from."""
+    def prepare(self, *, without: tuple[str, ...] = ()) -> None:
+        """The factor of the tangent and what rows answer with, for any number of ``pull``.
+
+        Args:
+            without: Nothing; all inputs are needed.
+        """
         system = self.system
         system.load()
         system.scale(0.0, inertia=False)
@@ -47,21 +51,29 @@ class StaticAdjoint(StepAdjoint):
         system.forces()
         system.tangent()
         system.exact_tangent(self.a_upper)
+        self.lu.factor(self.a_upper, self.shard.work.a)  # what is above the diagonal, transposed, is below that of A'
+        system.linear.y.zero()
+        system.rows.into_sides()
+        self.lu.solve(1 + self.model.row_count)
+
+    def pull(self, *, parameters: bool = True) -> None:
+        """Gradients by the equilibrium become those by what it follows from; needs ``prepare``.
+
+        Args:
+            parameters: Whether those by parameters are asked for.
+        """
         self._seed()
         self._solve_transposed()
         self.to_commands()
-        self._to_elements()
+        self._to_elements(parameters=parameters)
         self._to_state()
-        self._to_parameters()
+        if parameters:
+            self._to_parameters()
 
     def _solve_transposed(self) -> None:
         """p and q from A' p + H' q = y_x, -H p + C q = y_T."""
         s, m, w, linear, count = self.shard, self.model, self.shard.work, self.system.linear, self.model.row_count
-        self.lu.factor(self.a_upper, w.a)  # what is above the diagonal, transposed, is below that of A'
-        linear.y.zero()
-        self.system.rows.into_sides()
-        s.add(self.seed, linear.y, s.dof_rows)
-        self.lu.solve(1 + count)
+        self.lu.solve(1)
         if count:
             inputs = [m.dof_count, count, m.row_entry_start, m.entry_dof, w.row.S, linear.y.S]
             outputs = [self.gap.S, self.delassus.S]

@@ -97,12 +97,12 @@ class System:
 
     @property
     def follows_paths(self) -> bool:
-        """Whether ``QuasiStatic`` knows all effects of the scene."""
+        """Whether ``solve_static`` follows paths, as it does without chambers and cables that stretch."""
         return all(term.follows_paths for term in self.terms)
 
     @property
     def has_exact_tangent(self) -> bool:
-        """Whether ``exact_tangent`` knows all effects of the scene."""
+        """Whether ``exact_tangent`` and ``QuasiStatic`` know all effects of the scene."""
         return all(term.has_exact_tangent for term in self.terms)
 
     def with_options(

@@ -53,6 +53,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         else:
             compliance_out[w, count * row + side - 1] = total
 
+    @wp.kernel(module=module, enable_backward=False)
+    def add_own(
+        # Model
+        count: int,
+        # Workspace in
+        own_in: wp.array2d(dtype=S),
+        # Workspace out
+        compliance_out: wp.array2d(dtype=S),
+    ):
+        """W + C: rows that give way themselves, as cables that stretch and gas do."""
+        w, row = wp.tid()
+        if wp.static(world_fastest):
+            row, w = wp.tid()
+        compliance_out[w, count * row + row] = compliance_out[w, count * row + row] + own_in[w, row]
+
     @wp.func
     def solve_active(
         matrix: wp.array3d(dtype=real),
@@ -202,4 +217,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
             total += mul(y_in[w, 3 * size * (1 + i) + row], value_in[w, i])
         u_out[w, row] = total
 
-    return SimpleNamespace(compliance=compliance, active_set=active_set, combine=combine)
+    return SimpleNamespace(compliance=compliance, add_own=add_own, active_set=active_set, combine=combine)

@@ -226,20 +226,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
             else:
                 add_each(y_out, w, part, side, last - part, change)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def clamp_rows(
-        # Workspace in
-        lower_in: wp.array2d(dtype=S),
-        upper_in: wp.array2d(dtype=S),
-        # Workspace out
-        multiplier_out: wp.array2d(dtype=S),
-    ):
-        """Bring the multiplier of one row within the bounds of a new command."""
-        w, row = wp.tid()
-        if wp.static(world_fastest):
-            row, w = wp.tid()
-        multiplier_out[w, row] = wp.min(wp.max(multiplier_out[w, row], lower_in[w, row]), upper_in[w, row])
-
     @wp.func
     def soft_inverse(pivot: S, scale: S):
         """1 / pivot, turning smoothly into 0 where the pivot falls below the scale."""
@@ -426,7 +412,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reduce_row=reduce_row,
         reduce_gap=reduce_gap,
         unbounded_change=unbounded_change,
-        clamp_rows=clamp_rows,
         delassus=delassus,
         row_force=row_force,
         row_gap=row_gap,

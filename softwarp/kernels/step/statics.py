@@ -1,8 +1,9 @@
 """Path following from the start state to static equilibrium, world by world. Theory: docs/theory/statics.md.
 
-At the path parameter t the loads are short of (1 - t) times the imbalance of the start state, and every cable's target
-lies at the fraction t between its start value and its command: the start state solves t = 0, the equilibrium sought is
-t = 1. Each world walks along this path by itself: predict, correct, and go back to its last good point if that fails.
+At the path parameter t the loads are short of (1 - t) times the imbalance of the start state, and the target of every
+row lies at the fraction t between its start value and its command, as imposed tensions and pressures do: the start
+state solves t = 0, the equilibrium sought is t = 1. Each world walks along this path by itself: predict, correct, and
+go back to its last good point if that fails.
 """
 
 from types import SimpleNamespace
@@ -24,6 +25,7 @@ FAR = 20.0  # step bounds: a correction this long is taken for a failed one
 KICK = 0.02  # of the step bound: first step off an unstable equilibrium
 MIN_STRIDE = 0.003  # of t
 MIN_MASS = 3.0e-4  # E / (rho extent^2): first pseudo-mass
+FREE, PULLED, PRESSED = range(3)  # rows: no force imposed; a tension, the upper bound; a pressure, both bounds
 STALL_LIMIT = 5  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -76,31 +78,56 @@ def kernels(variant: Variant) -> SimpleNamespace:
         b_out[pack, row, lane] = b_out[pack, row, lane] - missing * start_imbalance_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def start_rows(
+        # Model
+        row_imposed: wp.array(dtype=wp.int32),
+        # Workspace in
+        displacement_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        lower_in: wp.array3d(dtype=real),
+        upper_in: wp.array3d(dtype=real),
+        # Workspace out
+        multiplier_out: wp.array3d(dtype=real),
+        value_out: wp.array3d(dtype=real),
+    ):
+        """Multipliers within the bounds of new commands, but pressures, and the targets that the start state meets."""
+        pack, row, lane = wp.tid()
+        multiplier = multiplier_out[pack, row, lane]
+        if row_imposed[row] != wp.static(PRESSED):
+            multiplier = wp.min(wp.max(multiplier, lower_in[pack, row, lane]), upper_in[pack, row, lane])
+        multiplier_out[pack, row, lane] = multiplier
+        value_out[pack, row, lane] = displacement_in[pack, row, lane] + compliance_in[pack, row, lane] * multiplier
+
+    @wp.kernel(module=module, enable_backward=False)
     def path_command(
         # Model
-        cable_force_control: wp.array(dtype=wp.int32),
+        row_imposed: wp.array(dtype=wp.int32),
         # Workspace in
         control_in: wp.array3d(dtype=real),
-        start_displacement_in: wp.array3d(dtype=real),
+        start_value_in: wp.array3d(dtype=real),
         start_multiplier_in: wp.array3d(dtype=real),
         # Workspace out
         target_out: wp.array3d(dtype=real),
+        lower_out: wp.array3d(dtype=real),
         upper_out: wp.array3d(dtype=real),
     ):
-        """Targets, and imposed tensions, at the present point of the path."""
+        """Targets, and imposed tensions and pressures, at the present point of the path."""
         pack, row, lane = wp.tid()
         t = control_in[pack, wp.static(T), lane]
-        start = start_displacement_in[pack, row, lane]
+        start = start_value_in[pack, row, lane]
         target_out[pack, row, lane] = start + t * (target_out[pack, row, lane] - start)
-        if cable_force_control[row] != 0:
+        if row_imposed[row] != wp.static(FREE):
             start = start_multiplier_in[pack, row, lane]
-            upper_out[pack, row, lane] = start + t * (upper_out[pack, row, lane] - start)
+            upper = start + t * (upper_out[pack, row, lane] - start)
+            upper_out[pack, row, lane] = upper
+            if row_imposed[row] == wp.static(PRESSED):
+                lower_out[pack, row, lane] = upper
 
     @wp.kernel(module=module, enable_backward=False)
     def measure(
         row_count: int,
         # Model
-        cable_rest_length: wp.array(dtype=real),
+        row_length: wp.array(dtype=real),
         # Workspace in
         norm_in: wp.array3d(dtype=real),
         gap_in: wp.array3d(dtype=real),
@@ -110,7 +137,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         control_out: wp.array3d(dtype=real),
     ):
-        """Merit of the present iterate: relative force imbalance plus worst constraint violation per cable length."""
+        """Merit of the present iterate: relative force imbalance plus worst violation of a row per length of it."""
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
         worst = real(0.0)
@@ -120,7 +147,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             at_lower = multiplier <= lower_in[pack, row, lane]
             at_upper = multiplier >= upper_in[pack, row, lane]
             if not ((at_lower and gap >= real(0.0)) or (at_upper and gap <= real(0.0))):
-                worst = wp.max(worst, wp.abs(gap) / cable_rest_length[row])
+                worst = wp.max(worst, wp.abs(gap) / row_length[row])
         control_out[pack, wp.static(IMBALANCE), lane] = imbalance
         control_out[pack, wp.static(MERIT), lane] = imbalance / (norm_in[pack, 1, lane] + real(1.0e-30)) + worst
 
@@ -374,6 +401,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         begin=begin,
         finish=finish,
         path_load=path_load,
+        start_rows=start_rows,
         path_command=path_command,
         measure=measure,
         arrive=arrive,

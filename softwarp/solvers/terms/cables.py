@@ -12,6 +12,8 @@ from softwarp.solvers.workspace.shard import Shard
 class CableTerm(Term):
     """Cables of one shard; theirs are the first rows."""
 
+    has_exact_tangent = True
+
     def __init__(self, shard: Shard) -> None:
         super().__init__(shard)
         self.is_elastic = bool(shard.model.cable_elastic.any())
@@ -19,11 +21,6 @@ class CableTerm(Term):
         self.k = cable.kernels(shard.variant)
         self.count = shard.model.cable_count
         self.stretches = wp.array(shard.model.cable_elastic, dtype=wp.int32, device=shard.device)
-
-    @property
-    def has_exact_tangent(self) -> bool:
-        """That of taut cables, whether they stretch or not."""
-        return True
 
     def load(self) -> None:
         """Tensions of the last step; flags for commands that are not finite."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from softwarp.kernels.frames import momentum
 from softwarp.kernels.rows import cavity, cavity_surface
 from softwarp.model.cavities import CavityModel
-from softwarp.model.codes import CavityControl
 from softwarp.solvers.terms.term import Pace, Term, load_factor
 from softwarp.solvers.workspace.shard import Shard
 
@@ -20,6 +19,7 @@ class CavityTerm(Term):
 
     refreshes = True
     responds = True
+    has_exact_tangent = True
 
     def __init__(self, shard: Shard, model: CavityModel) -> None:
         super().__init__(shard)
@@ -87,11 +87,6 @@ class CavityTerm(Term):
         """-p d2V/dx2, if asked for."""
         if self.shard.options.pressure_tangent:
             self._add_tangent(load_factor(h))
-
-    @property
-    def has_exact_tangent(self) -> bool:
-        """For prescribed pressures, on a coupled model."""
-        return bool((self.model.cavity_control.numpy() == CavityControl.PRESSURE).all())
 
     def stiffen(self) -> None:
         """The same in statics."""

@@ -13,7 +13,7 @@ from softwarp.solvers.workspace.shard import Shard
 class InversionTerm(Term):
     """Volume ratios of linear tetrahedra, and of quadratic ones at their Gauss points, where a step has led to."""
 
-    follows_paths = True
+    follows_paths = has_exact_tangent = True
 
     def __init__(self, shard: Shard) -> None:
         super().__init__(shard)

@@ -18,7 +18,7 @@ class QuadraticTerm(Term):
         model: Elements; their forces follow those of linear tets and membranes.
     """
 
-    follows_paths = True
+    follows_paths = has_exact_tangent = True
 
     def __init__(self, shard: Shard, model: QuadraticModel) -> None:
         super().__init__(shard)

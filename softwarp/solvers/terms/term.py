@@ -40,8 +40,9 @@ class Term:
         shard: Worlds, inputs and workspace.
 
     Attributes:
-        follows_paths: Whether statics know its exact tangent and the laws of its rows, so that they can follow a path.
-        has_exact_tangent: Whether its exact tangent is known, so that equilibria have gradients.
+        follows_paths: Whether ``solve_static`` follows a path with it.
+        has_exact_tangent: Whether its exact tangent and the laws of its rows are known, so that paths can be followed
+            and equilibria have gradients.
         corrections: Passes of a linear solve before which ``correct`` has something to do.
         unbounded: Static rows that obey no bounds and are eliminated.
         refreshes: Whether ``refresh`` writes outputs.
@@ -49,17 +50,13 @@ class Term:
     """
 
     follows_paths: bool = False
+    has_exact_tangent: bool = False
     corrections: int = 0
     refreshes: bool = False
     responds: bool = False
 
     def __init__(self, shard: Shard) -> None:
         self.shard = shard
-
-    @property
-    def has_exact_tangent(self) -> bool:
-        """As of what follows paths."""
-        return self.follows_paths
 
     @property
     def unbounded(self) -> Sequence[int]:

@@ -115,7 +115,7 @@ class LinearTets:
 class TetTerm(Term):
     """Linear tetrahedra of soft bodies."""
 
-    follows_paths = True
+    follows_paths = has_exact_tangent = True
 
     def __init__(self, shard: Shard) -> None:
         super().__init__(shard)

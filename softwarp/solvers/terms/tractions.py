@@ -16,7 +16,7 @@ class TractionTerm(Term):
         model: Tractions.
     """
 
-    follows_paths = True
+    follows_paths = has_exact_tangent = True
 
     def __init__(self, shard: Shard, model: TractionModel) -> None:
         super().__init__(shard)
