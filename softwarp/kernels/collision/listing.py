@@ -164,7 +164,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Append one world's reserve, from ``first`` on, if any of it overlaps at the end of the step; once a step.
 
-        All of it, because nothing looks again at where the step leads with those alone.
+        All of it, because nothing looks again at where the step leads with those alone. Else it goes on waiting.
         """
         pack, lane = wp.tid()
         count = count_out[pack, 0, lane]
@@ -201,9 +201,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     count += 1
                 else:
                     missed += 1
+            reserve_count_out[pack, 0, lane] = 0
         count_out[pack, 0, lane] = count
         overflow_out[pack, 0, lane] = overflow_out[pack, 0, lane] + missed
-        reserve_count_out[pack, 0, lane] = 0
 
     @wp.func
     def is_served(
