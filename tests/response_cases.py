@@ -307,19 +307,28 @@ def variant_of(name: str, precision: str) -> Variant:
 
 
 def random_case(
-    rng: np.random.Generator, name: str, precision: str, *, static: int = 0, unbounded: tuple[int, ...] = ()
+    rng: np.random.Generator,
+    name: str,
+    precision: str,
+    *,
+    static: int = 0,
+    unbounded: tuple[int, ...] = (),
+    counts: tuple[int, int, int] = (5, 0, 8),
+    symbolic: Symbolic | None = None,
 ) -> Case:
+    """Three worlds with ``counts`` contacts, on a random structure if none is given."""
     chosen = variant_of(name, precision)
-    symbolic = random_structure(rng)
+    symbolic = random_structure(rng) if symbolic is None else symbolic
     n, worlds = symbolic.size, 3
     free = np.ones((n, 3))
     free[4] = 0.0
     free[7, 1] = 0.0
     matrices = [random_matrix(symbolic, rng) for _ in range(worlds)]
     forces = [rng.standard_normal(3 * n) for _ in range(worlds)]
-    contacts = [random_contacts(rng, n, count) for count in (5, 0, 8)]
+    contacts = [random_contacts(rng, n, count) for count in counts]
     h = [rng.standard_normal((static, 3 * n)) for _ in range(worlds)] if static else None
     options = {"f_scale": 0.5, "x_scale": 0.8, "dof_free": free, "rows_h": h, "unbounded": unbounded}
+    options["capacity"] = max(12, *counts)
     options["in_panels"] = name == "panels"
     return Case(chosen, symbolic, matrices, forces, contacts, **options)
 

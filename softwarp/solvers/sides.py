@@ -19,6 +19,7 @@ from softwarp.kernels.rows import contact, contact_panel, contact_strips, contac
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
+from softwarp.solvers.linear import strips
 from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.subspace import nothing_touches
 from softwarp.solvers.workspace import rows
@@ -183,9 +184,13 @@ class ContactSides:
 class StripSides(ContactSides):
     """Sides of packs of eight worlds on a CPU, which run down the factor strip by strip."""
 
+    def _allocate(self, symbolic: Symbolic) -> None:
+        super()._allocate(symbolic)
+        self.strip_start = wp.array(strips.starts(symbolic, contact_strips.WIDTH), dtype=wp.int32, device=self.device)
+
     def _substitute(self, linear: LinearSolver) -> None:
         i = self.index
-        structure = [i["strip_start"].size - 1, i["strip_start"], i["l_row"], i["col_start"]]
+        structure = [self.strip_start.size - 1, self.strip_start, i["l_row"], i["col_start"]]
         inputs = [self.size, self.path_limit, *structure, self.pack_first.S, self.pack_count.S]
         inputs += [self.place.S, linear.lower.S, linear.diagonal.S]
         self._each_world(contact_strips.kernels().substitute, inputs, [self.side.S])

@@ -13,9 +13,10 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import features, geometry, shapes, touches
+from softwarp.kernels.collision.halving import AT_ONCE, box_halvings
 from softwarp.model.codes import CORNER, EDGE, FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
 
-BISECTIONS = 12  # halvings of an edge
+BISECTIONS = 4 * AT_ONCE  # halvings of an edge
 LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
 SAMPLES = 9  # of an edge before it is searched in a grid
 STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
@@ -24,8 +25,11 @@ UNSURE = 2.0  # times the inset: distance below which the normal of a corner is 
 
 
 @cache
-def functions(scalar: Any) -> SimpleNamespace:
-    """Distance of points and edges from shapes, in world coordinates."""
+def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
+    """Distance of points and edges from shapes, in world coordinates.
+
+    ``at_once`` is for a CPU in single precision: some halvings of an edge together.
+    """
     real = scalar
     types = geometry.structures(real)
     vec3, vec4 = types.vec3, types.vec4
@@ -209,6 +213,11 @@ def functions(scalar: Any) -> SimpleNamespace:
 
         Before, slopes are less than a negative bound, and not greater than a positive one.
         """
+        if wp.static(at_once):
+            if scene.target_kind[target] == wp.static(Target.BOX):
+                rounds = wp.static(BISECTIONS // AT_ONCE)
+                ends = box_halvings(scene.target_size[target], start, d, length, low, high, bound, rounds)
+                return ends[0], ends[1]
         left = low
         right = high
         halvings = int(0)
@@ -451,7 +460,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     place = geometry.functions(real)
     target_x, target_q = place.target_x, place.target_q
     frame_v = place.frame_v
-    touch_shape = functions(real).touch_shape
+    touch_shape = functions(real, real is wp.float32 and not variant.world_fastest).touch_shape
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     rotate = shapes.functions(real).rotate

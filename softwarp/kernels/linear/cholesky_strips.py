@@ -13,6 +13,8 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT, variant, vec8
 
+WIDTH = 4  # columns of a strip, at most; eight are no faster
+
 # Arithmetic on these goes lane by lane: nothing mixes worlds. A product and the sum that it is added to become one
 # instruction with one rounding, which Warp's compiler leaves out unless it is told.
 TYPES = f"""

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import touch
+from softwarp.kernels.rows import places, touch
 from softwarp.model.codes import SLOTS
 
 ROUNDING = 4.0  # eps of a contact's largest coordinate, up to which distances measured twice differ by rounding
@@ -40,6 +40,7 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
     rounding = ROUNDING * float(np.finfo(np.float64 if real is wp.float64 else np.float32).eps)
     module = variant.module("contact_together" if together else "contact")
     Touch, first_dof, own_axes, mode_row = vars(touch.functions(variant)).values()
+    unplace, number_places = places.unplace, places.numbering(S)
 
     @wp.func
     def slot_row(
@@ -85,8 +86,11 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
         base = contact * size
-        for row in range(size):
-            place_out[w, base + row] = -1
+        if wp.static(lanes > 1):
+            unplace(place_out, w, base, size)
+        else:
+            for row in range(size):
+                place_out[w, base + row] = -1
         first = size
         for lane in range(wp.static(lanes)):
             for slot in range(int(wp.static(SLOTS))):
@@ -109,13 +113,16 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
                         dof = parent[dof]
         k = int(0)
         start = contact * path_limit
-        for row in range(first, size):
-            if place_out[w, base + row] >= 0:
-                place_out[w, base + row] = k
-                path_out[w, start + k] = row
-                for c in range(9):
-                    side_out[w, 9 * (start + k) + c] = S(real(0.0))
-                k += 1
+        if wp.static(lanes > 1):
+            k = number_places(place_out, path_out, side_out, w, base, first, size, start)
+        else:
+            for row in range(first, size):
+                if place_out[w, base + row] >= 0:
+                    place_out[w, base + row] = k
+                    path_out[w, start + k] = row
+                    for c in range(9):
+                        side_out[w, 9 * (start + k) + c] = S(real(0.0))
+                    k += 1
         path_size_out[w, contact] = k
 
     @wp.kernel(module=module, enable_backward=False)

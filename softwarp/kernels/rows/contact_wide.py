@@ -14,7 +14,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.rows import contact as contact_rows
-from softwarp.kernels.rows import touch
+from softwarp.kernels.rows import places, touch
 from softwarp.model.codes import SLOTS
 
 GROUP = 8  # contacts
@@ -30,36 +30,6 @@ _END = """
 #undef LOAD
 #undef STORE
 """
-
-
-@wp.func_native("__builtin_memset(&wp::index(place_out, w, first), 0xff, count * sizeof(int));")
-def unplace(place_out: wp.array2d(dtype=wp.int32), w: int, first: int, count: int):
-    """Set the places of ``count`` dofs to -1, none."""
-
-
-@wp.func_native(f"""
-int* const place = &wp::index(place_out, w, base);
-int* const path = &wp::index(path_out, w, start);
-int found = 0;
-for (int row = first; row < size; ++row)
-    if (place[row] >= 0) {{
-        place[row] = found;
-        path[found++] = row;
-    }}
-if (found > 0) __builtin_memset(&wp::index(side_out, w, {BLOCK} * start), 0, {BLOCK} * found * sizeof(float));
-return found;
-""")
-def number_places(
-    place_out: wp.array2d(dtype=wp.int32),
-    path_out: wp.array2d(dtype=wp.int32),
-    side_out: wp.array2d(dtype=wp.float32),
-    w: int,
-    base: int,
-    first: int,
-    size: int,
-    start: int,
-) -> int:
-    """Number the dofs from ``first`` on that have a place, list them, and clear their sides; returns how many."""
 
 
 @wp.func_native(
@@ -268,6 +238,7 @@ def kernels() -> SimpleNamespace:
     module = scalar.module("contact_wide")
     slot_row = contact_rows.kernels(scalar).slot_row
     Touch, first_dof, own_axes, mode_row = vars(touch.functions(scalar)).values()
+    unplace, number_places = places.unplace, places.numbering(wp.float32)
     columns = wp.types.vector(COLUMNS, wp.float32)
 
     @wp.kernel(module=module, enable_backward=False)

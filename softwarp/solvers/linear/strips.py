@@ -16,9 +16,9 @@ from itertools import pairwise
 import numpy as np
 
 from softwarp.kernels.linear.cholesky_runs import MOST
+from softwarp.kernels.linear.cholesky_strips import WIDTH
 from softwarp.model.structure import IntArray, Symbolic
 
-WIDTH = 4  # columns of eight worlds; eight are no faster
 ALONE_FROM = 20  # products for every block of L, from which on wide strips pay for a world by itself
 NAMES = ("strip_start", "strip_source", "source", "place")  # of the arrays, as kernels take them
 RUN_NAMES = ("run_strip_start", "run_strip_source", "run_source", "run_place", "run")  # those for one world at a time
@@ -85,7 +85,7 @@ def runs(symbolic: Symbolic) -> Runs:
 
 def schedule(symbolic: Symbolic, most: int = WIDTH) -> Strips:
     """Divide the columns into strips of some at most, and list the sources of each."""
-    start = _starts(symbolic, most)
+    start = starts(symbolic, most)
     rows = [_rows_below(symbolic, int(end) - 1) for end in start[1:]]
     strip_of = np.repeat(np.arange(start.size - 1), np.diff(start))
     number = np.zeros(symbolic.size, dtype=np.int32)
@@ -114,7 +114,7 @@ def schedule(symbolic: Symbolic, most: int = WIDTH) -> Strips:
     )
 
 
-def _starts(symbolic: Symbolic, most: int) -> IntArray:
+def starts(symbolic: Symbolic, most: int) -> IntArray:
     """First columns of all strips, and the number of columns."""
     count = np.diff(symbolic.col_start)
     start = [0] if symbolic.size else []

@@ -8,9 +8,10 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.rows import contact as contact_kernels
-from softwarp.kernels.rows import contact_force
+from softwarp.kernels.rows import contact_force, contact_strips
 from softwarp.plan.ordering import analyze
 from softwarp.solvers.collision.contact_list import SLOTS
+from softwarp.solvers.linear import strips
 from softwarp.solvers.sides import longest_path
 from softwarp.solvers.workspace.rows import Rows
 from tests.response_cases import (
@@ -66,6 +67,26 @@ def test_matrix_equals_dense(name: str, precision: str, tolerance: float, rng: n
         order, used = case.response.order, len(expected)
         found = get(case.response.matrix, world).reshape(order, order)[:used, :used]
         np.testing.assert_allclose(found, expected, atol=tolerance * np.abs(expected).max())
+
+
+def test_many_contacts_go_down_wide_strips(rng: np.random.Generator) -> None:
+    """W of worlds in lanes as above, with more pairs of contacts than go together, an odd one, and wide strips.
+
+    All dofs of a block of 26 are neighbours, so that its columns are strips of eight and one of two, and paths begin
+    anywhere in them; below hang the chains of ``random_structure``.
+    """
+    block = np.array(list(itertools.combinations(range(20, 46), 2)))
+    chains = np.array([[i, i + 1] for i in range(19) if i != 9] + [[9, 20], [19, 21]])
+    symbolic = analyze(np.concatenate([chains, block]).astype(np.int32), 46)
+    case = random_case(rng, "lanes", "float32", static=2, counts=(37, 4, 31), symbolic=symbolic)
+    strip = np.diff(strips.starts(symbolic, contact_strips.WIDTH))
+    assert strip.max() == contact_strips.WIDTH and 2 * contact_strips.AT_ONCE < 37
+    case.build()
+    for world in range(case.worlds):
+        expected = case.reference(world)
+        order, used = case.response.order, len(expected)
+        found = get(case.response.matrix, world).reshape(order, order)[:used, :used]
+        np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
 
 
 def test_dofs_that_gather_forces_have_the_same_bits(rng: np.random.Generator) -> None:
