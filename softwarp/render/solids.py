@@ -31,10 +31,10 @@ class Solids:
         rest: Rest positions of the nodes [m], shape (node, 3).
         parts: Rigid bodies and rods.
         placed: Where these are at rest, n = 1.
-        least_radius: Of rods, as they are drawn [m].
         hidden: Piece that is left out because it is the floor, or None.
         twist: Whether rods carry a stripe that shows their twist.
         device: Warp device.
+        least_radius: Of rods, as they are drawn [m].
     """
 
     def __init__(
@@ -44,10 +44,10 @@ class Solids:
         parts: Parts,
         placed: Placement,
         *,
-        least_radius: float,
         hidden: int | None,
         twist: bool,
         device: str,
+        least_radius: float = 0.0,
     ) -> None:
         self.parts, self.device = parts, device
         self._radius = np.maximum(parts.rod_radius, least_radius)
