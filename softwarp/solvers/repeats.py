@@ -51,7 +51,7 @@ class RepeatingEuler:
         self.places = _places(system)
         model = replace(system.model, num_worlds=self.places)
         here = (create(State, model), create(Control, model), create(Parameters, model))
-        options = twin_options(system.options)
+        options = twin_options(system.options, system.model.precision)
         self.twin = System(model, system.index, system.variant, here[0], here[1], here[2], options)
         self.control = NewtonControl(self.twin, still=True)
         self.newton = ImplicitEuler(self.twin, h, control=self.control, tells=False, swings=SWINGS, brief=True)
@@ -141,10 +141,14 @@ def repeats_steps(model: Model, options: Options) -> bool:
     return model.telescopes is not None and is_linear and options.repeat_swing < float("inf")
 
 
-def twin_options(options: Options) -> Options:
-    """Options of the steps that are repeated: more iterations, and what penetrates is taken back whole."""
+def twin_options(options: Options, precision: str) -> Options:
+    """Options of the steps that are repeated: more iterations, and what penetrates is taken back whole.
+
+    In float64 an iteration solves once: the next one corrects it. In float32 it cannot measure what that leaves.
+    """
     return replace(
         options,
+        refinement=options.refinement if precision == "float32" else 0,
         newton_iterations=ITERATIONS,
         newton_tolerance=TOLERANCE,
         gauss_seidel_iterations=min(SWEEPS, options.gauss_seidel_iterations),
