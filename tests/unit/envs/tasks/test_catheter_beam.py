@@ -219,6 +219,13 @@ def test_options_that_make_no_sense(options: dict[str, Any], message: str) -> No
         CatheterBeamConfig(**options)
 
 
+def test_more_anatomies_than_a_grid_holds_are_refused_by_their_options() -> None:
+    """With both ways out."""
+    said = r"anatomies=2 with grid=0.0008 m: .* use a spacing of 0.00\d+ m or more, for grid, or fewer anatomies"
+    with pytest.raises(ValueError, match=said):
+        make(anatomy="random", anatomies=2, outlets=2, grid=0.0008)
+
+
 def test_instruments_go_from_the_innermost_on() -> None:
     """Numbers of the instruments, as options, actions and observations order them."""
     assert (COIL, GUIDE, CATHETER) == (0, 1, 2)
