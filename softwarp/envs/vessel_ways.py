@@ -41,6 +41,7 @@ class VesselWays:
 
         self.points = table([tree.points for tree in trees], _FAR, torch.float32)  # (vessel, point, 3)
         self.direction = table([tree.direction for tree in trees], 0.0, torch.float32)
+        self.radius = table([tree.radius for tree in trees], 0.0, torch.float32)  # m, of the lumen, (vessel, point)
         # Ways, whether a step along the vessel makes them shorter, and points ahead: (vessel, point, outlet, ...)
         self.ways = table([tree.ways.T for tree in trees], 0.0, torch.float32)
         gain = [np.where(tree.ways[:, tree.parent] > tree.ways, -1.0, 1.0).T for tree in trees]
@@ -87,6 +88,11 @@ class VesselWays:
         """Unit vector of the vessel where a place is, towards an outlet, (world, 3)."""
         point = located[0]
         return -self.gain[vessel, point, outlet][:, None] * self.direction[vessel, point]
+
+    def aside(self, vessel: Tensor, located: tuple[Tensor, Tensor], place: Tensor) -> Tensor:
+        """From the centre line to a place across it [m], (world, 3)."""
+        point, beyond = located
+        return place - self.points[vessel, point] - beyond[:, None] * self.direction[vessel, point]
 
     def next_fork(self, vessel: Tensor, outlet: Tensor, located: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """Way to the fork at which the way to an outlet next takes a branch, or to the outlet, and to which side.

@@ -10,6 +10,7 @@ from softwarp.model import memory
 from softwarp.model.model import Model
 from softwarp.scene.materials import lame
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace import rows
 
 ROUNDING_FLOAT32 = 1e-3  # relative imbalance that coordinates of this precision can cause in stiff, thin bodies
 ROUNDING_FLOAT64 = 1e-10
@@ -20,11 +21,17 @@ class NewtonControl:
 
     Args:
         system: Worlds to iterate.
+<<<<<<< HEAD
         still: Keep the forces of contacts of worlds that have converged, too, and what their sweeps left, so that
             iterations of others change nothing there.
+=======
+        still: Keep the forces of contacts of worlds that have converged, too, so that iterations of others change
+            nothing there; their contacts are not worked on.
+>>>>>>> e5b1986ebd93d765fc7a63c26b77766236df89b2
 
     Attributes:
         left: 1 while worlds have not converged; of ``look_for_others``.
+        spare: Not 0 in worlds that nobody asks for, which need not converge, where there are any; int, 1 row.
     """
 
     def __init__(self, system: System, *, still: bool = False) -> None:
@@ -35,13 +42,23 @@ class NewtonControl:
         allocate, dofs = self.shard.rows, self.shard.dof_rows
         self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
         self.left = memory.zeros((1,), wp.int32, self.shard.device)
+<<<<<<< HEAD
         still_rows = (*system.multipliers.contact_forces, system.work.residual) if still else ()
         self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
+=======
+        forces = (*system.multipliers.contact_forces, system.work.residual) if still else ()
+        self.still = [(force, allocate(force.real.shape[1])) for force in forces]
+        worlds = (self.shard.variant, self.shard.world_count, 1, self.shard.device, wp.int32)
+        self.spare = rows.allocate(*worlds)
+        self.idle = rows.allocate(*worlds) if system.contact is None else system.contact.contacts.idle
+>>>>>>> e5b1986ebd93d765fc7a63c26b77766236df89b2
         count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
 
     def begin(self) -> None:
-        """Reset the control rows of all worlds."""
+        """Reset the control rows of all worlds, whose contacts all are worked on."""
+        if self.still:
+            self.idle.zero()
         self.shard.each_real(self.kernels.begin, None, [], [self.system.work.control.real])
         self.multiplier.copy_from(self.system.work.multiplier)
 
@@ -71,6 +88,7 @@ class NewtonControl:
     def look_for_others(self) -> None:
         """Whether there are worlds that have not converged, for ``left``; what converged ones are to keep."""
         self.left.zero_()
+<<<<<<< HEAD
         self.shard.each_real(self.kernels.look_for_others, None, [self.system.work.control.real], [self.left])
         for values, held in self.still:
             held.copy_from(values)
@@ -80,6 +98,12 @@ class NewtonControl:
         for values, held in self.still:
             inputs = [self.system.work.control.real, held.real]
             self.shard.each_real(self.kernels.hold_still, values.real.shape[1], inputs, [values.real])
+=======
+        inputs = [self.system.work.control.real, self.spare.real]
+        self.shard.each_real(self.kernels.look_for_others, None, inputs, [self.idle.real, self.left])
+        for force, held in self.still:
+            held.copy_from(force)
+>>>>>>> e5b1986ebd93d765fc7a63c26b77766236df89b2
 
     def advance(self, h: float) -> None:
         """Move on from the last accepted iterate of every world that has not converged."""

@@ -51,10 +51,10 @@ class RepeatingEuler:
         self.places = _places(system)
         model = replace(system.model, num_worlds=self.places)
         here = (create(State, model), create(Control, model), create(Parameters, model))
-        options = twin_options(system.options)
+        options = twin_options(system.options, system.model.precision)
         self.twin = System(model, system.index, system.variant, here[0], here[1], here[2], options)
-        control = NewtonControl(self.twin, still=True)
-        self.newton = ImplicitEuler(self.twin, h, control=control, tells=False, swings=SWINGS, brief=True)
+        self.control = NewtonControl(self.twin, still=True)
+        self.newton = ImplicitEuler(self.twin, h, control=self.control, tells=False, swings=SWINGS, brief=True)
         state = {name: getattr(s.state, name) for name in declarations(State)}
         self.state = {name: array for name, array in state.items() if array.shape[1]}
         self.start = {name: allocate(worlds, a.shape[1], a.dtype, s.device) for name, a in self.state.items()}
@@ -114,6 +114,8 @@ class RepeatingEuler:
         for source, target in self.held:
             kernel = self.k.take_integers if target.dtype is wp.int32 else self.k.take
             self._copy(kernel, target.shape[1], [source, self.progress, self.order], target)
+        t = self.twin.shard
+        t.each_real(self.k.spare, None, [t.lanes, self.progress], [self.control.spare.real])
         self.newton.step()
         status = self.twin.state.status
         for source, target in self.found:
@@ -139,10 +141,14 @@ def repeats_steps(model: Model, options: Options) -> bool:
     return model.telescopes is not None and is_linear and options.repeat_swing < float("inf")
 
 
-def twin_options(options: Options) -> Options:
-    """Options of the steps that are repeated: more iterations, and what penetrates is taken back whole."""
+def twin_options(options: Options, precision: str) -> Options:
+    """Options of the steps that are repeated: more iterations, and what penetrates is taken back whole.
+
+    In float64 an iteration solves once: the next one corrects it. In float32 it cannot measure what that leaves.
+    """
     return replace(
         options,
+        refinement=options.refinement if precision == "float32" else 0,
         newton_iterations=ITERATIONS,
         newton_tolerance=TOLERANCE,
         gauss_seidel_iterations=min(SWEEPS, options.gauss_seidel_iterations),

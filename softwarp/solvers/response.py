@@ -295,6 +295,7 @@ class ContactResponse:
         inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
         if modes is None or modes.forces is None:
             if self.variant.world_fastest and self.size <= FEW_DOFS:
+                inputs.insert(2, c.idle.real)
                 self._each_real(self.k_force.gather_force, self.size, inputs, [target.real])
             else:
                 self._each_real(self.k_force.add_force, None, inputs, [target.real])

@@ -31,6 +31,7 @@ from softwarp.meshing.aorta_geometry import MOST_OUTLETS, OUTLETS, RADIUS
 from softwarp.ranges import Seed
 
 ANATOMY_KINDS = ("reference", "random")
+OBSERVATION_KINDS = ("compact", "local", "paper")
 MOST_ANATOMIES = 64
 COIL, GUIDE, CATHETER = range(3)
 
@@ -130,6 +131,7 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
     success_tolerance: Distance = 0.005  # m, how near a tip must come at any time
     outlet: Further | None = None  # always this one; None draws it
     start_turn: HalfAngle = math.pi  # rad, instruments begin to turn to angles up to this, drawn; SofaGym's begin at 0
+    observation: str = "compact"  # "compact", "local" (in the frame of the guide's hook) or "paper"
     force_scale: Positive = 1.0  # N worth 1 in an observation
 
     def __post_init__(self) -> None:
@@ -142,6 +144,11 @@ class CatheterBeamConfig(CatheterSceneConfig, TubesConfig):
             raise ValueError(
                 f"{type(self).__name__}: outlet must be one of 0 to {count - 1}, or None for any, got {self.outlet!r}"
             )
+
+    @property
+    def observation_kinds(self) -> tuple[str, ...]:
+        """What ``observation`` may be."""
+        return OBSERVATION_KINDS
 
     @classmethod
     def paper(cls, **options: Any) -> CatheterBeamConfig:

@@ -51,7 +51,7 @@ class TubesConfig(EnvConfig):
         """Check names and ranges."""
         EnvConfig.__post_init__(self)
         check_choice(self, "action_kind", ACTION_KINDS)
-        check_choice(self, "observation", OBSERVATION_KINDS)
+        check_choice(self, "observation", self.observation_kinds)
         check_choice(self, "reward", REWARD_KINDS)
         name = type(self).__name__
         if not self.force_limit > 0.0:
@@ -65,6 +65,11 @@ class TubesConfig(EnvConfig):
                 f"{name}: nested tubes need first_lengths that do not rise from the innermost tube to the outermost, "
                 f"got {self.first_lengths!r}; take {tuple(sorted(self.first_lengths, reverse=True))!r}, or nested=False"
             )
+
+    @property
+    def observation_kinds(self) -> tuple[str, ...]:
+        """What ``observation`` may be."""
+        return OBSERVATION_KINDS
 
     def check_reach(self, key: str, most: tuple[float, ...]) -> None:
         """Refuse tubes that are out farther at the start, or move farther in an action, than they may come out.

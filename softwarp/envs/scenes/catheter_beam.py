@@ -48,7 +48,13 @@ def build_catheter_scene(config: CatheterSceneConfig, builder: ModelBuilder, fir
     keys = config.anatomy_keys()
     trees = tuple(make_anatomy(key) for key in keys)
     offsets = _side_by_side(trees)
-    vessel = _vessel(keys, config.grid)
+    try:
+        vessel = _vessel(keys, config.grid)
+    except ValueError as error:
+        if len(keys) == 1:
+            raise
+        told = f"{type(config).__name__}: anatomies={len(keys)} with grid={config.grid:g} m"
+        raise ValueError(f"{told}: {error}, for grid, or fewer anatomies") from None
     wall = builder.add_rigid(vessel, kinematic=True, name="vessel")
     instruments = builder.add_telescope(
         make_instruments(config),

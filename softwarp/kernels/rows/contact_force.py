@@ -10,6 +10,7 @@ from softwarp.kernels.rows import contact as contact_rows
 from softwarp.model.codes import SLOTS
 
 CHUNK = 8  # slots whose loop the compiler unrolls; a part of SLOTS
+HELD = 24  # slots that a thread may have found before it adds them
 
 
 @cache
@@ -19,6 +20,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     module = variant.module("contact_force")
     slot_row = contact_rows.kernels(variant).slot_row
+    Held = wp.types.vector(HELD, wp.int32)
 
     @wp.func
     def add_slot(
@@ -80,12 +82,34 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         target_out,
                     )
 
+    @wp.func
+    def add_slots(
+        held: Held,
+        count: int,
+        dof_free: wp.array2d(dtype=real),
+        weight: wp.array3d(dtype=real),
+        lever: wp.array3d(dtype=real),
+        axes: wp.array3d(dtype=real),
+        multiplier: wp.array3d(dtype=real),
+        f_scale: real,
+        pack: int,
+        lane: int,
+        dof: int,
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Add the forces of contacts on a dof at the slots that are held, in their order."""
+        for k in range(count):
+            contact = held[k] // wp.static(SLOTS)
+            slot = held[k] % wp.static(SLOTS)
+            add_slot(dof_free, weight, lever, axes, multiplier, f_scale, pack, lane, contact, slot, dof, target_out)
+
     @wp.kernel(module=module, enable_backward=False)
     def gather_force(
         # Model
         dof_free: wp.array2d(dtype=real),
         # Workspace in
         count_in: wp.array3d(dtype=wp.int32),
+        idle_in: wp.array3d(dtype=wp.int32),
         dof_in: wp.array3d(dtype=wp.int32),
         weight_in: wp.array3d(dtype=real),
         lever_in: wp.array3d(dtype=real),
@@ -95,31 +119,58 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         target_out: wp.array3d(dtype=real),
     ):
-        """The same with a thread for every dof, for GPUs, where one for all of a world waits for each of its sums."""
+        """The same with a thread for every dof, for GPUs, where one for all of a world waits for each of its sums.
+
+        A warp waits for the world in it that has something to add, so slots are searched first and added then.
+        Slots are filled from the first one on. Nobody asks for forces in idle worlds.
+        """
         pack, dof, lane = wp.tid()
+        if idle_in[pack, 0, lane] != 0:
+            return
+        held = Held()
+        found = int(0)
         for contact in range(count_in[pack, 0, lane]):
-            is_touched = bool(False)
-            for part in range(wp.static(SLOTS // CHUNK)):  # unrolled: these loads do not wait for each other
-                for place in range(wp.static(CHUNK)):
-                    row = wp.static(SLOTS) * contact + part * wp.static(CHUNK) + place
-                    if dof_in[pack, row, lane] == dof:
-                        is_touched = True
-            if is_touched:
-                for slot in range(int(wp.static(SLOTS))):
-                    if dof_in[pack, wp.static(SLOTS) * contact + slot, lane] == dof:
-                        add_slot(
-                            dof_free,
-                            weight_in,
-                            lever_in,
-                            axes_in,
-                            multiplier_in,
-                            f_scale,
-                            pack,
-                            lane,
-                            contact,
-                            slot,
-                            dof,
-                            target_out,
-                        )
+            first = wp.static(SLOTS) * contact
+            end = first + wp.static(SLOTS)
+            while first < end:
+                last = int(-1)
+                for place in range(wp.static(CHUNK)):  # unrolled: these loads do not wait for each other
+                    last = dof_in[pack, first + place, lane]
+                    if last == dof:
+                        held[found] = first + place
+                        found += 1
+                if found > wp.static(HELD - CHUNK):
+                    add_slots(
+                        held,
+                        found,
+                        dof_free,
+                        weight_in,
+                        lever_in,
+                        axes_in,
+                        multiplier_in,
+                        f_scale,
+                        pack,
+                        lane,
+                        dof,
+                        target_out,
+                    )
+                    found = 0
+                first += wp.static(CHUNK)
+                if last < 0:
+                    first = end
+        add_slots(
+            held,
+            found,
+            dof_free,
+            weight_in,
+            lever_in,
+            axes_in,
+            multiplier_in,
+            f_scale,
+            pack,
+            lane,
+            dof,
+            target_out,
+        )
 
     return SimpleNamespace(add_force=add_force, gather_force=gather_force)

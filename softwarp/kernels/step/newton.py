@@ -259,13 +259,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def look_for_others(
         # Workspace in
         control_in: wp.array3d(dtype=real),
+        spare_in: wp.array3d(dtype=wp.int32),
         # Workspace out
+        idle_out: wp.array3d(dtype=wp.int32),
         left_out: wp.array(dtype=wp.int32),
     ):
-        """Whether a world has not converged."""
+        """Whether a world has not converged, which then is not idle; spare ones always are."""
         pack, lane = wp.tid()
-        if control_in[pack, wp.static(FROZEN), lane] < real(0.5):
+        idle = int(1)
+        if control_in[pack, wp.static(FROZEN), lane] < real(0.5) and spare_in[pack, 0, lane] == 0:
+            idle = int(0)
             wp.atomic_max(left_out, 0, 1)  # few worlds
+        idle_out[pack, 0, lane] = idle
 
     @wp.kernel(module=module, enable_backward=False)
     def hold_still(

@@ -90,6 +90,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         left_out[sample] = wp.max(progress_out[wp.static(COUNT)] - done, 0)
 
     @wp.kernel(module=module, enable_backward=False)
+    def spare(
+        lanes: int,
+        # Workspace in
+        progress_in: wp.array(dtype=wp.int32),
+        # Workspace out
+        spare_out: wp.array3d(dtype=wp.int32),
+    ):
+        """Places without a world of their own, which only repeat what another one does."""
+        pack, lane = wp.tid()
+        has_world = progress_in[wp.static(DONE)] + pack * lanes + lane < progress_in[wp.static(COUNT)]
+        spare_out[pack, 0, lane] = wp.where(has_world, 0, 1)
+
+    @wp.kernel(module=module, enable_backward=False)
     def take(
         # State
         value_in: wp.array2d(dtype=real),
@@ -179,6 +192,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         choose=choose,
         number=number,
         go_on=go_on,
+        spare=spare,
         take=take,
         take_integers=take_integers,
         give=give,

@@ -26,12 +26,12 @@ def catheter_baseline(env: Any) -> Policy:
     """The policy for CatheterBeam, from its observations alone.
 
     Args:
-        env: A CatheterBeam, bare or transformed, with compact observations.
+        env: A CatheterBeam, bare or transformed, with compact or local observations.
 
     Raises:
         ValueError: If observations are the paper's, which hold no directions.
     """
-    env.decode(torch.zeros(1, 40))  # refuses what cannot be read
+    env.decode(torch.zeros(1, *env.observation_spec["observation"].shape[1:]))  # refuses what cannot be read
     config = env.config
     insert, turn = torch.tensor(config.insert_step), torch.tensor(config.turn_step)
 

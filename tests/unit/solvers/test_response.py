@@ -96,8 +96,10 @@ def test_dofs_that_gather_forces_have_the_same_bits(rng: np.random.Generator) ->
     put(case.contacts.multiplier, list(rng.standard_normal((case.worlds, 3 * case.contacts.capacity))))
     start, found = rng.standard_normal((case.worlds, n)), []
     c = response.contacts
-    given = [response.dof_free, c.count.real, c.dof.real, c.weight.real, c.lever.real, c.axes.real, c.multiplier.real]
-    for kernel, items in ((response.k_force.add_force, ()), (response.k_force.gather_force, (case.n,))):
+    rows = [c.dof.real, c.weight.real, c.lever.real, c.axes.real, c.multiplier.real]
+    counted, asked = [response.dof_free, c.count.real, *rows], [response.dof_free, c.count.real, c.idle.real, *rows]
+    kernels = response.k_force
+    for kernel, items, given in ((kernels.add_force, (), counted), (kernels.gather_force, (case.n,), asked)):
         put(case.u, list(start))
         dim = (case.u.real.shape[0], *items, case.u.real.shape[2])
         wp.launch(kernel, dim=dim, inputs=[*given, 0.3], outputs=[case.u.real], device="cpu")

@@ -125,6 +125,7 @@ def test_the_limit_of_force_costs_and_ends() -> None:
     for _ in range(6):
         data = act(env, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
         torch.testing.assert_close(data["observation"][:, -1], (env.force / env.config.force_scale).clamp_max(4.0))
+        torch.testing.assert_close(data["wall_force"], torch.stack((env.force, env.peak_force), dim=1))
         torch.testing.assert_close(data["terminated"][:, 0], env.force > 1e-6)
         ended |= data["terminated"][:, 0]
         terms = env.reward_terms(torch.zeros(2, 6), data["distance"][:, 0])
@@ -153,8 +154,8 @@ def test_every_world_has_an_anatomy_of_its_own() -> None:
 
 def test_the_hand_written_policy_takes_the_right_branch() -> None:
     """To an outlet on either side of the first fork: 0.25 m of the way are behind it, for both kinds of actions."""
-    for kind in ("continuous", "discrete"):
-        env = make(num_worlds=2, seed=0, action_kind=kind)
+    for kind, seen in (("continuous", "local"), ("discrete", "compact")):
+        env = make(num_worlds=2, seed=0, action_kind=kind, observation=seen)
         policy = catheter_baseline(env)
         env.reset()
         env.outlet.copy_(torch.tensor([0, 6]))
@@ -164,6 +165,30 @@ def test_the_hand_written_policy_takes_the_right_branch() -> None:
             data = env.step(policy(TensorDict({"observation": data["observation"]}, batch_size=2)))["next"]
         left = env._way_left()
         assert (left < 0.83).all(), (kind, left)
+
+
+def test_local_observations_tell_the_same_in_the_frame_of_the_hook() -> None:
+    """Turned to world axes by that frame vectors are those of compact ones; the wall ends the tip's way aside."""
+    env = make(num_worlds=3, observation="local")
+    env.reset()
+    for _ in range(4):
+        data = act(env, 0.2, 0.4, 1.0, -0.5, 0.6, 0.1)
+    frame, seen = env.hook_frame(), env.decode(data["observation"])
+    torch.testing.assert_close(frame @ frame.mT, torch.eye(3).expand(3, 3, 3), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(torch.linalg.det(frame), torch.ones(3), atol=1e-6, rtol=0.0)
+    turned = {name: part.unflatten(1, (-1, 3)) @ frame for name, part in seen.items() if part.shape[1] % 3 == 0}
+    length, tip = env.sim.tube_length.float(), env.tip()
+    expected = {"hook": env.hook(), "to_goal": env.goal - tip, "direction": env.direction()}
+    located = env.ways.locate(env.anatomy, tip)
+    expected["along"] = env.ways.along(env.anatomy, env.outlet, located)
+    expected["ahead"] = env.ways.look_ahead(env.anatomy, env.outlet, located) - tip[:, None]
+    expected["side"] = env.ways.next_fork(env.anatomy, env.outlet, located)[1]
+    for name, value in expected.items():
+        torch.testing.assert_close(turned[name].flatten(1), value.flatten(1), atol=2e-6, rtol=0.0, msg=name)
+    torch.testing.assert_close(seen["length"], length)
+    room = seen["radius"][:, 0] - seen["aside"].norm(dim=1)
+    np.testing.assert_allclose(room, env.scene.vessel.clearance(tip.double().numpy()), atol=env.config.grid)
+    assert (seen["aside"].norm(dim=1) > 1e-4).any()
 
 
 def test_policy_needs_compact_observations() -> None:
@@ -192,6 +217,13 @@ def test_options_that_make_no_sense(options: dict[str, Any], message: str) -> No
     """Each is refused by name."""
     with pytest.raises(ValueError, match=message):
         CatheterBeamConfig(**options)
+
+
+def test_more_anatomies_than_a_grid_holds_are_refused_by_their_options() -> None:
+    """With both ways out."""
+    said = r"anatomies=2 with grid=0.0008 m: .* use a spacing of 0.00\d+ m or more, for grid, or fewer anatomies"
+    with pytest.raises(ValueError, match=said):
+        make(anatomy="random", anatomies=2, outlets=2, grid=0.0008)
 
 
 def test_instruments_go_from_the_innermost_on() -> None:
