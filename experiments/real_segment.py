@@ -25,6 +25,7 @@ from softwarp.identification import Fit, Parameter, Worlds, fit
 from softwarp.io.atomic import atomic_path
 from softwarp.meshing.prisms import cut_prisms, split_quads
 
+from . import segment_gradient
 from .real import Outcome, Row, measured
 
 Floats = NDArray[np.float64]
@@ -102,9 +103,10 @@ class Segment:
 
     Args:
         candidates: Parameter sets that are inflated together.
+        precision: Of the model.
     """
 
-    def __init__(self, candidates: int = CANDIDATES) -> None:
+    def __init__(self, candidates: int = CANDIDATES, precision: str = "float32") -> None:
         solid = mesh()
         builder = sw.ModelBuilder()
         body = builder.add_tets(
@@ -122,9 +124,20 @@ class Segment:
         self.tip = np.flatnonzero(solid.nodes[:, 2] < 1e-6)
         self.solid = solid
         self.sim = sw.Simulation(
-            builder.finalize(num_worlds=candidates), dt=DT, pressure_tangent=True, solver_path="scalar"
+            builder.finalize(num_worlds=candidates, precision=precision),
+            dt=DT,
+            pressure_tangent=True,
+            solver_path="scalar",
         )
         self.worlds = Worlds(self.sim, PARAMETERS)
+
+    def write(self, values: Floats) -> None:
+        """Parameters (candidate, parameter) into the worlds, which go back to the start without pressure."""
+        self.sim.reset()
+        self.worlds.write(values)
+        per_loop = self.worlds.column(values, "winding") * self.spacing
+        self.sim.params.cable_stiffness[...] = self.sim.params.cable_stiffness.new_tensor(per_loop)[:, None]
+        self.sim.control.cavity_pressure.zero_()
 
     def displacements(self, values: Floats, pressures: Floats) -> Floats:
         """Distance that the centre of the bottom has moved from where it hangs without pressure.
@@ -136,11 +149,7 @@ class Segment:
         Returns:
             Displacements [mm], shape (candidate, pressure); nan from where a world failed.
         """
-        self.sim.reset()
-        self.worlds.write(values)
-        per_loop = self.worlds.column(values, "winding") * self.spacing
-        self.sim.params.cable_stiffness[...] = self.sim.params.cable_stiffness.new_tensor(per_loop)[:, None]
-        self.sim.control.cavity_pressure.zero_()
+        self.write(values)
         self.sim.step(REST)
         rest, before = self.place(), 0.0
         found = []
@@ -182,20 +191,21 @@ class Case:
 
     def fit(self, **options: Any) -> tuple[Fit, Segment]:
         """Fit modulus and winding to the low pressures; the error at all others is told as held out."""
-        model = Segment()
         last = int(np.flatnonzero(self.fitted).max()) + 1
+        pressures, told = 100.0 * self.mbar[:last], self.displacement[:last]
+        given = {"held_out": ~self.fitted[:last], "noise": NOISE, "tolerance": 1e-2, "max_iterations": 12, **options}
+        if options.get("method") == "gradient":
+            segments, model = (Segment(count, "float64") for count in (1 + last, 1))
+            exact = segment_gradient.Displacements(segments, model, pressures)
+            return fit(
+                PARAMETERS, segment_gradient.residuals(exact, told), **{**given, "method": "least_squares"}
+            ), model
+        model = Segment()
 
         def residuals(values: Floats) -> Floats:
-            return model.displacements(values, 100.0 * self.mbar[:last]) - self.displacement[:last]
+            return model.displacements(values, pressures) - told
 
-        return fit(
-            PARAMETERS,
-            residuals,
-            batch=CANDIDATES,
-            held_out=~self.fitted[:last],
-            noise=NOISE,
-            **{"tolerance": 1e-2, "max_iterations": 12, **options},
-        ), model
+        return fit(PARAMETERS, residuals, batch=CANDIDATES, **given), model
 
 
 def identify(extra: Path | None = None, **options: Any) -> Fit:

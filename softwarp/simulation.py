@@ -14,7 +14,6 @@ from softwarp.measures import Measures
 from softwarp.model import memory
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, create_parameters, worlds_slice
-from softwarp.plan.compile import coupled
 from softwarp.scene import Handle, SoftBody
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.footprint import require_room, with_room
@@ -172,6 +171,7 @@ class Simulation(
         self._systems = self._make_shards(model, self._state)
         self._contact_growth = checks.flag(contact_growth, "Simulation: contact_growth") and model.contact is not None
         self._workers = Workers(self._turns) if self._turns > 1 else None
+        self._exact: tuple[Model, dict[str, wp.array]] | None = None
         self._statics: list[QuasiStatic] | None = None
         self._relaxations: dict[bool, list[Relaxation]] | None = None
         self._initial: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}  # view and what reset writes into it
@@ -470,8 +470,8 @@ class Simulation(
             )
         options, model, index = self.options, self.model, None
         if exact:
-            options, model = replace(options, project_tangent=False), coupled(model)
-            index = upload(model.symbolic, model.device)
+            options = replace(options, project_tangent=False)
+            model, index = self._coupled()
 
         def make() -> list[System]:
             return [system.with_options(options, model, index, more_sides, exact=exact) for system in self._systems]

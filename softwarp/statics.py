@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from softwarp import checks, interop, notices
 from softwarp.model.codes import StaticReason, Status
@@ -114,6 +115,7 @@ class Statics:
     _systems: list[System]
     _bounds: list[tuple[int, int]]
     _views: dict[str, torch.Tensor]
+    _exact: tuple[Model, dict[str, wp.array]] | None
     _statics: list[QuasiStatic] | None
     _relaxations: dict[bool, list[Relaxation]] | None
 
@@ -196,8 +198,7 @@ class Statics:
         limit = (1e-9 if self.model.precision == "float64" else 1e-4) if tolerance is None else tolerance
         if self._statics is None:
             exact = replace(self.options, project_tangent=False)
-            model = coupled(self.model)
-            index = upload(model.symbolic, model.device)
+            model, index = self._coupled()
 
             def make() -> list[QuasiStatic]:
                 return [QuasiStatic(s.with_options(exact, model, index, exact=True)) for s in self._systems]
@@ -287,6 +288,13 @@ class Statics:
                 reasons[begin:end] <= StaticReason.ROUNDING, course.longest[begin:end], 0.0
             )
         return _Found(course.way.copy(), iterations, reasons, told)
+
+    def _coupled(self) -> tuple[Model, dict[str, wp.array]]:
+        """The scene with room in A for the exact tangent, and its structure on the device; found once."""
+        if self._exact is None:
+            model = coupled(self.model)
+            self._exact = model, upload(model.symbolic, model.device)
+        return self._exact
 
     def _has_exact_tangent(self) -> np.ndarray[Any, Any]:
         """Worlds whose rods have an exact tangent, shape (world,): no cables, and no moments on nodes or bodies.

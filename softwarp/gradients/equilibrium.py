@@ -14,6 +14,7 @@ from softwarp.gradients.frame_equilibrium import AtRest, FrameWorlds, after
 from softwarp.gradients.refusals import Diverged, require_static_gradient
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.rollout import Markers, fitted, tensors_of
+from softwarp.gradients.soft_equilibrium import Corrections
 from softwarp.gradients.worlds import Replayed
 from softwarp.model.gradients import COMMANDS, PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
@@ -101,6 +102,7 @@ class Equilibrium:
         self._prepare, self._pull = (
             Replayed(model.device, [getattr(pull, name) for pull in pulls], workers) for name in ("prepare", "pull")
         )
+        self._corrections = [Corrections(pull) for pull in pulls] if warm else []
         self._last: tuple[torch.Tensor, ...] | None = None  # positions, tensions and pressures
         self._solved, self._prepared = 0, 0  # numbers of equilibria: the last, and the one whose tangent is there
         self.shape = RestShape(model, sim.node_x) if rest else None
@@ -123,8 +125,9 @@ class Equilibrium:
             parameters: ``youngs``, ``nu``, ``density``, ``gravity``, ``law_parameter``, ``cable_stiffness``,
                 ``rod_youngs``, ``rod_nu``, ``rod_density`` and ``body_mass``, likewise of ``sim.params``. With ``rest``
                 also ``rest_x`` [m], the rest positions of the model, (node, 3).
-            tolerance: As of ``solve_static``; of rods and rigid bodies, the last correction in extents of the scene and
-                rad, None taking 1e-5 in float32 and 1e-10 in float64. A gradient is as exact as the equilibrium is.
+            tolerance: As of ``solve_static``. With ``warm``, and of rods and rigid bodies, the last correction, or what
+                may be left to go after it, in extents of the scene and rad, None taking 1e-5 in float32 and 1e-10 in
+                float64. A gradient is as exact as the equilibrium is.
             max_iterations: As of ``solve_static``, or corrections.
 
         Returns:
@@ -194,11 +197,6 @@ class Equilibrium:
             else:
                 groups[group][own].copy_(value)
 
-    def start(self) -> None:
-        """Put the last equilibrium in place, where there is one and solves start from it."""
-        if self.warm and self._last is not None:
-            self._put(self._last)
-
     def settle(self, limits: dict[str, Any]) -> tuple[int, tuple[torch.Tensor, ...]]:
         """Bring the worlds to rest; the number of this equilibrium, and positions, tensions and pressures.
 
@@ -206,17 +204,32 @@ class Equilibrium:
             Diverged: If a world is not at rest.
         """
         sim = self.sim
-        found = sim.follow_static(**limits)
-        self.check(found.converged, sim.compression)
-        self._last = sim.node_x.clone(), sim.cable_tension.clone(), sim.cavity_pressure.clone()
+        arrived = torch.zeros(sim.num_worlds, dtype=torch.bool, device=sim.node_x.device)
+        near = tuple(view.clone() for view in self._places()) if self._last is None or not self.warm else self._last
+        if self._corrections:
+            self._put(near)
+            is_near = self._solved > 0 and self._prepared == self._solved
+            self._prepared = -1  # another tangent takes the place of that of a pose
+            arrived = torch.cat([each.settle(limits["tolerance"], prepared=is_near) for each in self._corrections])
+        if not arrived.all():
+            held = [view.clone() for view in self._places()]
+            masks = [arrived.reshape(-1, *[1] * (view.ndim - 1)) for view in held]
+            self._put(tuple(map(torch.where, masks, held, near)))
+            converged = sim.follow_static(**limits).converged.to(arrived.device)
+            self.check(converged | arrived, sim.compression)
+            self._put(tuple(map(torch.where, masks, held, self._places())))
+        self.check(torch.ones_like(arrived), sim.compression)
+        self._last = tuple(view.clone() for view in self._places())
         self._solved += 1
         return self._solved, self._last
 
+    def _places(self) -> tuple[torch.Tensor, ...]:
+        return self.sim.node_x, self.sim.cable_tension, self.sim.cavity_pressure
+
     def _put(self, held: tuple[torch.Tensor, ...]) -> None:
-        sim = self.sim
-        for view, value in zip((sim.node_x, sim.cable_tension, sim.cavity_pressure), held, strict=True):
+        for view, value in zip(self._places(), held, strict=True):
             view.copy_(value)
-        sim.node_v.zero_()
+        self.sim.node_v.zero_()
 
     def pull(self, number: int, held: tuple[torch.Tensor, ...]) -> None:
         """Gradients by an equilibrium become those by commands and parameters, which are in place.
@@ -259,7 +272,6 @@ class _Rest(torch.autograd.Function):
             owner.place(dict(zip(names, tensors, strict=True)))
             held = [*sim.control.tensors().values(), *sim.params.tensors().values()]
             commands = [view.clone() for view in held]
-            owner.start()
             number, found = owner.settle(limits)
         finally:
             sim.restore(before)

@@ -45,7 +45,7 @@ LAYERS = (
         *("solvers.directional", "solvers.frame_tangent", "solvers.joint_adjoint", "solvers.look_adjoint"),
         *("solvers.second_order", "solvers.static_adjoint"),
     ),
-    ("solvers.look_directional", "solvers.second_order_adjoint"),
+    ("solvers.look_directional", "solvers.second_order_adjoint", "solvers.static_newton"),
     ("solvers.footprint",),
     ("solvers.inverse", "solvers.relaxation"),
     ("interop",),

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from experiments import real, real_segment, real_tentacle, tentacle_gradient, validate
+from experiments import real, real_segment, real_tentacle, segment_gradient, tentacle_gradient, validate
 from softwarp import cli
 
 
@@ -134,6 +134,28 @@ def test_segment():
     assert not outcome.fit.at_bound
 
 
+@pytest.mark.slow
+def test_segment_by_gradient(monkeypatch):
+    """At rest where long steps come to, to 0.001 mm; slopes are central differences to 1e-4."""
+    pressures = np.array([1e4, 2e4])
+    monkeypatch.setattr(segment_gradient, "TOLERANCE", 1e-9)  # differences want more than a fit
+    single = real_segment.Segment(1, "float64")
+    exact = segment_gradient.Displacements(real_segment.Segment(3, "float64"), single, pressures)
+    values = torch.tensor([[4.35e5, 4.9e4]], dtype=torch.float64, requires_grad=True)
+    found = exact(values)
+    inflated = real_segment.Segment(1)
+    for hold, near in ((real_segment.HOLD, 0.03), (40, 1e-3)):  # mm; those of a fit are not quite at rest
+        monkeypatch.setattr(real_segment, "HOLD", hold)
+        stepped = inflated.displacements(values.detach().numpy(), pressures)
+        np.testing.assert_allclose(found.detach().numpy(), stepped, rtol=0, atol=near)
+    slopes = [torch.autograd.grad(part, values, retain_graph=True)[0][0] for part in found[0]]
+    for number, step in enumerate((4350.0, 490.0)):
+        change = step * torch.eye(2, dtype=torch.float64)[number][None]
+        sides = [exact(values.detach() + sign * change)[0] for sign in (1.0, -1.0, 2.0, -2.0)]
+        expected = (8.0 * (sides[0] - sides[1]) - (sides[2] - sides[3])) / (12.0 * step)
+        np.testing.assert_allclose([float(s[number]) for s in slopes], expected.detach().numpy(), rtol=1e-4)
+
+
 def test_verbs_refuse_wrong_names(capsys):
     assert cli.main(["validate", "reel"]) == cli.BAD_INPUT
     assert "no kind 'reel'; did you mean 'real'" in capsys.readouterr().err
@@ -142,7 +164,7 @@ def test_verbs_refuse_wrong_names(capsys):
     assert cli.main(["identify", "segmnt"]) == cli.BAD_INPUT
     assert "no case 'segmnt'; did you mean 'segment'" in capsys.readouterr().err
     assert cli.main(["identify", "beam", "--method", "gradient"]) == cli.BAD_INPUT
-    assert "residuals of beam are not differentiated, only those of tentacle" in capsys.readouterr().err
+    assert "residuals of beam are not differentiated, only those of segment, tentacle" in capsys.readouterr().err
 
 
 def test_page_and_json(tmp_path, monkeypatch, capsys):

@@ -17,6 +17,7 @@ LAWS = [
     *(pytest.param("large", control, True, marks=pytest.mark.slow) for control in (None, "pressure", "volume", "gas")),
     *(pytest.param("nh_log", control, False, marks=pytest.mark.slow) for control in ("volume", "gas")),
 ]
+KINDS = [("large", None), ("nh_log", "gas"), ("nh_log", "volume")]
 CHAMBERS = ("cavity_pressure", "cavity_volume", "cavity_gas")
 STEPS = {
     "node_force": 1e-4,
@@ -36,7 +37,13 @@ STEPS = {
 
 
 def beam(
-    law: str = "large", num_worlds: int = 1, *, chamber: str | None = None, quadratic: bool = False, **options: object
+    law: str = "large",
+    num_worlds: int = 1,
+    *,
+    chamber: str | None = None,
+    quadratic: bool = False,
+    precision: str = "float64",
+    **options: object,
 ) -> sw.Simulation:
     """A beam held at one end, with a taut cable of each control and a slack one, perhaps with a chamber in it.
 
@@ -61,7 +68,7 @@ def beam(
             body, skin.nodes + (0.03, 0.01, 0.01), skin.surface(), control=chamber, max_pressure_rate=1e3
         )  # type: ignore[arg-type]
     builder.add_marker(body, (0.1, 0.02, 0.02))
-    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), **options)  # type: ignore[arg-type]
+    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision=precision), **options)  # type: ignore[arg-type]
     sim.control.cable_displacement[...] = torch.tensor([0.004, 0.0, -0.02]).to(sim.node_x)
     sim.control.cable_tension[...] = 0.5
     sim.control.cavity_pressure[...] = 5e3
@@ -136,6 +143,40 @@ def test_world_of_a_batch_and_the_simulation_stay_as_they_are() -> None:
     assert all(torch.equal(value, before.arrays[name]) for name, value in sims[0].snapshot().arrays.items())
     for world in range(3):
         assert torch.equal(gradient(sims[1], youngs[world : world + 1])[0], together[world])
+
+
+@pytest.mark.parametrize(
+    ("law", "chamber"), [("nh_log", "pressure"), *(pytest.param(*k, marks=pytest.mark.slow) for k in KINDS)]
+)
+def test_from_the_last_pose(law: str, chamber: str | None) -> None:
+    """Poses and gradients from the pose before are those from rest, also where a world has to be led there."""
+    sims = [beam(law, 2, chamber=chamber) for _ in range(2)]
+    warm, cold = Equilibrium(sims[0], warm=True), Equilibrium(sims[1])
+    led = []
+    follow = sims[0].follow_static
+    sims[0].follow_static = lambda **limits: led.append(1) or follow(**limits)  # type: ignore[method-assign]
+    for modulus in (1e5, 1.05e5, 1.03e5, 3e5, 2.9e5, 2.85e5):
+        youngs = torch.tensor([[modulus], [1.1 * modulus]], dtype=torch.float64, requires_grad=True)
+        found = []
+        for equilibrium, tolerance in ((warm, 1e-11), (cold, 1e-13)):
+            pose = equilibrium(parameters={"youngs": youngs}, tolerance=tolerance)
+            x, force = pose.marker_x[..., 2].sum(), pose.cavity_pressure.sum() + pose.cable_tension.sum()
+            slopes = [torch.autograd.grad(part, youngs, retain_graph=True)[0] for part in (x, force)]
+            found.append((pose.node_x.detach(), pose.cable_tension.detach(), *slopes))
+        for ours, theirs in zip(*found, strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-10 * float(theirs.abs().max()) + 1e-12)
+    assert len(led) <= 3  # at the start, and after the leap
+
+
+@pytest.mark.parametrize("path", ["lanes", "scalar"])
+def test_worlds_at_rest_from_the_last_pose(path: str) -> None:
+    """Worlds of a pack go their own ways: in float32, with unequal moduli, as from rest; to rounding."""
+    sims = [beam("nh_log", 5, chamber="pressure", precision="float32", solver_path=path) for _ in range(2)]
+    warm, cold = Equilibrium(sims[0], warm=True), Equilibrium(sims[1])
+    for factor in (1.0, 1.1, 1.05):
+        youngs = factor * torch.tensor([[0.8e5], [1e5], [1.3e5], [1e5], [2e5]])
+        poses = [equilibrium(parameters={"youngs": youngs}) for equilibrium in (warm, cold)]
+        torch.testing.assert_close(poses[0].node_x, poses[1].node_x, rtol=0.0, atol=2e-5)
 
 
 def test_refusals() -> None:
