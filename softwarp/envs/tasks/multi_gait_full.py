@@ -87,6 +87,7 @@ class MultiGaitFull(SoftEnv):
     config: MultiGaitFullConfig
     scene: MultiGaitScene
     viewed_from = (-0.3, -0.9, 0.6)
+    sweep_tolerance = 1.0e-6  # of extents of the scene: a micrometre; a tenth of it leads a gait no nearer to float64's
 
     @property
     def gravity(self) -> tuple[float, float, float]:

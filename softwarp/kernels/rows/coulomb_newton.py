@@ -22,7 +22,7 @@ LONGEST = 1000.0  # way, relative to the correction that it starts from
 DAMPING = 1.0e-5  # of the system's diagonal, for rows that repeat each other
 PIVOT = 1.0e-6  # least pivot, relative to the diagonal
 ON_CONE = 1.0e-5  # relative distance from the cone within which a contact slides
-NEVER = 1.0e9  # sweeps until a world with too many rows tries again
+AGAIN = 8  # sweeps until a world with too many rows asks again: some of them open
 
 # What a world remembers, in rows of its own: whether Newton's method leads it, whether the acceleration's memory must
 # be emptied (1) or its last guess was taken back (0.5), the least squared correction since it leads, ways gone, whether
@@ -123,7 +123,8 @@ for (int lane = 0; lane < LANES; ++lane) {
         for (int axis = 0; axis < axes; ++axis) at[size++] = i + axis;
     }
     if (size > MOST) {
-        leads = 0; AT(state, LEFT) = NEVER; AT(state, FRESH) = 1; led[lane] = 0;
+        leads = 0; AT(state, LEFT) = AGAIN; led[lane] = 0;
+        if (AT(state, TRIED) > 1) AT(state, FRESH) = 1;  // else the acceleration goes on as if not asked
         continue;
     }
     if (size == 0) continue;
@@ -169,7 +170,7 @@ for (int lane = 0; lane < LANES; ++lane) {
                 n1[l] = t1 / length; n2[l] = t2 / length;
                 const REAL slip = -(slack[p + 1] * n1[l] + slack[p + 2] * n2[l]) / length;
                 kind[unknowns] = ACROSS; of[unknowns] = l; number[unknowns] = p;
-                extra[unknowns] = slip > 0 ? slip : 0;
+                extra[unknowns] = SIZE(slip);
                 right[unknowns++] = n2[l] * slack[p + 1] - n1[l] * slack[p + 2];
             }
         }
@@ -373,7 +374,7 @@ def _constants(lanes: int, first_state: int, first_vector: int) -> str:
         "DAMPING",
         "PIVOT",
         "ON_CONE",
-        "NEVER",
+        "AGAIN",
     )
     names += "LEADS", "FRESH", "BEST", "TRIED", "WAITS", "LEFT", "SPENT"
     values = {name: globals()[name] for name in names}

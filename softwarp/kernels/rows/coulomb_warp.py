@@ -18,7 +18,7 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import coulomb_warp_newton, warp_share, warp_visits
 from softwarp.kernels.rows.anderson import BEYOND, DAMPING, LONGEST, MEMORY, RESTART
 from softwarp.kernels.rows.coulomb import NEAR, STALL, STALLED
-from softwarp.kernels.rows.coulomb_newton import NEVER, REST
+from softwarp.kernels.rows.coulomb_newton import AGAIN, REST
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
 from softwarp.kernels.rows.coulomb_warp_newton import GOES, LARGE, RESTS
 
@@ -390,6 +390,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
                         tries = int(0)
                         least = real(1.0e30)
                     if leads:  # Newton's method: judge the last way and go the next one
+                        before = last_end
                         value, change, last_end, least, tries, verdict = follow(
                             system,
                             delassus,
@@ -423,8 +424,11 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
                         waits = verdict == wp.static(GOES)
                         if verdict > wp.static(RESTS):
                             leads = False
-                            is_fresh = True
-                            rest = wp.where(is_led, wp.static(REST), wp.static(int(NEVER)))
+                            if is_led or tries > 1:
+                                is_fresh = True
+                            else:  # too many rows: the acceleration goes on as if not asked
+                                last_end = before
+                            rest = wp.where(is_led, wp.static(REST), wp.static(AGAIN))
                     if not is_led:
                         if is_fresh:
                             empty_history(history, w, order, thread, rows, count)

@@ -16,7 +16,7 @@ from softwarp.kernels.rows.coulomb_newton import DAMPING, EVENTS, GROWN, HEAVY, 
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
 from softwarp.kernels.rows.warp_share import first_thread, meet, places, told_number
 
-MOST = 48  # rows of a system up to which it is solved: all worlds wait for the one that takes longest
+MOST = 95  # rows of a system up to which it is solved: all worlds wait for the one that takes longest
 TRIES = 10  # ways that are gone before a world goes on with the acceleration
 
 NONE, FIXED, LOW, HIGH, FREE, OPEN, BARE, STICK, SLIDE = range(9)  # no law that holds; those of rows, then of contacts
@@ -315,7 +315,7 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                         if kind == wp.static(SLIDE):
                             n1[k] = value[e + 1] / length
                             n2[k] = value[e + 2] / length
-                            turn[k] = wp.max(-(slack[e + 1] * n1[k] + slack[e + 2] * n2[k]) / length, real(0.0))
+                            turn[k] = wp.abs(slack[e + 1] * n1[k] + slack[e + 2] * n2[k]) / length
                     wanted = wp.where(kind == wp.static(STICK), 3, wp.where(kind == wp.static(SLIDE), 2, 0))
                     found = places(wp.where(kind == wp.static(BARE), 1, wanted), thread)
                     first[wp.static(first_contact) + k] = unknowns + (found & 65535)

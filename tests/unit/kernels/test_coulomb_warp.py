@@ -97,6 +97,35 @@ def test_a_gpu_sweeps_as_a_cpu_does(monkeypatch: pytest.MonkeyPatch, precision: 
         assert np.abs(slip[inside]).max(initial=0.0) < 1e-6
 
 
+class DrawnPlate(Case):
+    """A plate in 6 rigid motions and 24 others on 24 points, which a floor stops while it is drawn along."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        super().__init__(0, 24, 30, mu=0.7)
+        x, y = rng.uniform(-1.0, 1.0, (24, 2)).T
+        one, none = np.ones(24), np.zeros(24)
+        rigid = np.array([[one, y, -x, none, none, none], [none, none, none, one, none, -y], [none] * 4 + [one, x]])
+        rigid = rigid.transpose(2, 0, 1)
+        moves = np.concatenate([rigid, 0.3 * rng.standard_normal((24, 3, 24))], axis=2).reshape(72, 30)
+        self.matrix = 1.0e-3 * moves @ moves.T
+        drawn = moves[:, 3:6] @ (1.0e-3 * rng.standard_normal(3))
+        load = np.abs(rng.standard_normal(24))
+        self.free = drawn - self.matrix[:, ::3] @ load + 2.0e-4 * rng.standard_normal(72)
+
+
+@pytest.mark.parametrize("near", [None, pytest.param(0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [4, 7, 31])
+def test_points_drawn_along_together_come_to_rest(monkeypatch: pytest.MonkeyPatch, seed: int, near: int | None) -> None:
+    """Many contacts slide, some for an instant against their friction: 541 sweeps and more without |nu|."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    _, force, gap, residual = swept(DrawnPlate(seed), "float32", 25, near=near)
+    press, friction = force[::3], np.linalg.norm(force.reshape(-1, 3)[:, 1:], axis=1)
+    assert residual <= 1.0e-7
+    assert np.all(gap[::3] > -2e-6) and np.abs(press * gap[::3]).max() < 2e-6
+    assert np.count_nonzero(friction[press > 0] > 0.69 * press[press > 0]) > 4
+
+
 @pytest.mark.slow
 def test_more_rows_than_newton_takes_are_left_to_the_acceleration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
