@@ -21,13 +21,8 @@ class NewtonControl:
 
     Args:
         system: Worlds to iterate.
-<<<<<<< HEAD
         still: Keep the forces of contacts of worlds that have converged, too, and what their sweeps left, so that
-            iterations of others change nothing there.
-=======
-        still: Keep the forces of contacts of worlds that have converged, too, so that iterations of others change
-            nothing there; their contacts are not worked on.
->>>>>>> e5b1986ebd93d765fc7a63c26b77766236df89b2
+            iterations of others change nothing there; their contacts are not worked on.
 
     Attributes:
         left: 1 while worlds have not converged; of ``look_for_others``.
@@ -42,16 +37,11 @@ class NewtonControl:
         allocate, dofs = self.shard.rows, self.shard.dof_rows
         self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
         self.left = memory.zeros((1,), wp.int32, self.shard.device)
-<<<<<<< HEAD
         still_rows = (*system.multipliers.contact_forces, system.work.residual) if still else ()
         self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
-=======
-        forces = (*system.multipliers.contact_forces, system.work.residual) if still else ()
-        self.still = [(force, allocate(force.real.shape[1])) for force in forces]
         worlds = (self.shard.variant, self.shard.world_count, 1, self.shard.device, wp.int32)
         self.spare = rows.allocate(*worlds)
         self.idle = rows.allocate(*worlds) if system.contact is None else system.contact.contacts.idle
->>>>>>> e5b1986ebd93d765fc7a63c26b77766236df89b2
         count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
 
@@ -88,8 +78,8 @@ class NewtonControl:
     def look_for_others(self) -> None:
         """Whether there are worlds that have not converged, for ``left``; what converged ones are to keep."""
         self.left.zero_()
-<<<<<<< HEAD
-        self.shard.each_real(self.kernels.look_for_others, None, [self.system.work.control.real], [self.left])
+        inputs = [self.system.work.control.real, self.spare.real]
+        self.shard.each_real(self.kernels.look_for_others, None, inputs, [self.idle.real, self.left])
         for values, held in self.still:
             held.copy_from(values)
 
@@ -98,12 +88,6 @@ class NewtonControl:
         for values, held in self.still:
             inputs = [self.system.work.control.real, held.real]
             self.shard.each_real(self.kernels.hold_still, values.real.shape[1], inputs, [values.real])
-=======
-        inputs = [self.system.work.control.real, self.spare.real]
-        self.shard.each_real(self.kernels.look_for_others, None, inputs, [self.idle.real, self.left])
-        for force, held in self.still:
-            held.copy_from(force)
->>>>>>> e5b1986ebd93d765fc7a63c26b77766236df89b2
 
     def advance(self, h: float) -> None:
         """Move on from the last accepted iterate of every world that has not converged."""
