@@ -7,6 +7,7 @@ CABLE_SLACK, CABLE_TAUT = (0.86, 0.87, 0.90), (0.98, 0.50, 0.08)
 CABLE_TAUT_ON_STRESS = (0.05, 0.80, 0.95)  # a hue that the stress scale lacks
 MEMBRANE = (0.13, 0.33, 0.45)
 ROD, ROD_STRIPE = (0.33, 0.40, 0.58), (0.98, 0.84, 0.55)
+ROD_THIN = (0.93, 0.40, 0.08)  # far too thin for its picture, where it is drawn wider
 KINEMATIC = (0.62, 0.64, 0.68)  # rigid bodies whose motion is prescribed
 RIGID = (  # free rigid bodies, in turn
     (0.90, 0.73, 0.46),

@@ -4,6 +4,7 @@ Every world has its own bounding volume hierarchy over the surface of its bodies
 ray per pixel and a shadow ray where it lands; pixels on an edge are cast again with four rays.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -41,6 +42,7 @@ _EDGE_CONTRAST = 0.035  # difference between neighbouring pixels, on a square-ro
 _CABLE_RADIUS = 0.0045  # of the size of the body
 _MEMBRANE_COVER = 0.55  # how much of its colour a triangle owes to a membrane on it
 _GOAL_RADIUS = 0.035  # of the size of the body
+_LEAST_ROD, _LEAST_CABLE, _LEAST_GOAL = 1.25, 0.7, 3.0  # pixels, least drawn radii in the middle of the picture
 _LIGHT_SPREAD = 0.045  # tangent of the key light's half angle: softens shadows
 _BATCH_PIXELS = 1 << 24  # pixels held at once; more worlds are drawn in turns
 
@@ -126,13 +128,25 @@ class RayCaster(Unpicklable, instead="make it there: RayCaster.for_model(sim.mod
         self.size = self.parts.scene_size(rest_x[tri], start.rigid_pose[0], start.rod_x[0])
         self._up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
         self._ground = self.parts.ground(start.rigid_pose[0], self._up)
+        away = float(np.linalg.norm(np.subtract(self.camera.target, self.camera.eye)))
+        self._pixel = 2.0 * math.tan(0.5 * math.radians(self.camera.fov)) * away / height  # m
         self._look = self._lit(shown, cable_radius, goal_radius)
         self._view = view_of(self.camera, width, height)
         self._floor = default_floor(self._look, self._up, self.device)
         held = np.zeros(self.node_count, dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
         self._node_color = np.where(held[:, None], palette.CLAMP, palette.BODY)
         self._cable_color = np.tile(palette.CABLE, (len(self.cable_point_start) - 1, 1))
-        self._solids = Solids(tri, rest_x, self.parts, start, hidden=self._ground, twist=twist, device=self.device)
+        least = _LEAST_ROD * self._pixel
+        self._solids = Solids(
+            tri,
+            rest_x,
+            self.parts,
+            start,
+            least_radius=least,
+            hidden=self._ground,
+            twist=twist,
+            device=self.device,
+        )
         self._chambers = Layer(self.parts.cavity_tri, np.asarray(start.cavity_x[0]), 50.0, self.device)
         self._notes: tuple[NDArray[np.int32], Layer] | None = None
         cover = np.zeros(max(len(tri), 1)) if tri_membrane is None else np.asarray(tri_membrane) >= 0
@@ -145,6 +159,7 @@ class RayCaster(Unpicklable, instead="make it there: RayCaster.for_model(sim.mod
         """Light, colours and measures for the positions to show [m]."""
         cable = _CABLE_RADIUS * self.size if cable_radius is None else cable_radius
         goal = _GOAL_RADIUS * self.size if goal_radius is None else goal_radius
+        cable, goal = max(cable, _LEAST_CABLE * self._pixel), max(goal, _LEAST_GOAL * self._pixel)
         look = look_of(shown, self._up, self.camera, self.size, cable, goal)
         # Few rays make a wide penumbra grainy, so it narrows with their number.
         look.light_spread = _LIGHT_SPREAD * min(1.0, (self.samples - 1) / 12.0)

@@ -20,6 +20,7 @@ Ints = NDArray[np.int32]
 _SOFT_CREASE, _HARD_CREASE = 50.0, 32.0  # degrees between neighbouring faces that are shaded as an edge
 _RESOLUTION = 48  # corners of a full circle
 _SIDES = 24  # of a rod
+_THIN = 0.5  # of the radius as it is drawn: thinner rods have a colour that is seen
 
 
 class Solids:
@@ -33,6 +34,7 @@ class Solids:
         hidden: Piece that is left out because it is the floor, or None.
         twist: Whether rods carry a stripe that shows their twist.
         device: Warp device.
+        least_radius: Of rods, as they are drawn [m].
     """
 
     def __init__(
@@ -45,8 +47,10 @@ class Solids:
         hidden: int | None,
         twist: bool,
         device: str,
+        least_radius: float = 0.0,
     ) -> None:
         self.parts, self.device = parts, device
+        self._radius = np.maximum(parts.rod_radius, least_radius)
         self.vertex_node, soft = compact_surface(triangles)
         self.soft_tris = len(soft)
         local, rigid, rigid_tri = _rigid_surface(parts, hidden)
@@ -75,7 +79,7 @@ class Solids:
         """Vertices of all rods together [m], shape (n, v, 3)."""
         x, q = (np.asarray(a.detach().cpu() if hasattr(a, "detach") else a) for a in (rod_x, rod_q))
         each = [
-            tubes.sweep(x[:, at], q[:, at], self.parts.rod_radius[at], _SIDES, fine)
+            tubes.sweep(x[:, at], q[:, at], self._radius[at], _SIDES, fine)
             for at, fine in zip(map(self.parts.rod_points, range(self.parts.rod_count)), self._fine, strict=True)
         ]
         return np.concatenate([np.empty((len(x), 0, 3)), *each], axis=1)
@@ -100,10 +104,14 @@ class Solids:
     def _rod_surface(self, twist: bool) -> tuple[Ints, Floats]:
         """Triangles and vertex colours (sRGB) of all rods."""
         triangles, colors, first = [np.empty((0, 3), dtype=np.int32)], [np.empty((0, 3))], 0
-        for nodes, fine in zip(np.diff(self.parts.rod_point_start), self._fine, strict=True):
-            marked = tubes.stripe(int(nodes), _SIDES, fine) & twist
-            triangles.append(tubes.tube_triangles(int(nodes), _SIDES, fine) + first)
-            colors.append(np.where(marked[:, None], palette.ROD_STRIPE, palette.ROD))
+        for rod, fine in enumerate(self._fine):
+            at = self.parts.rod_points(rod)
+            nodes = at.stop - at.start
+            marked = tubes.stripe(nodes, _SIDES, fine) & twist
+            is_thin = (self.parts.rod_radius[at] < _THIN * self._radius[at]).all()
+            own = palette.ROD_THIN if is_thin else palette.ROD
+            triangles.append(tubes.tube_triangles(nodes, _SIDES, fine) + first)
+            colors.append(np.where(marked[:, None], palette.ROD_STRIPE, own))
             first += len(marked)
         return np.concatenate(triangles), np.concatenate(colors)
 

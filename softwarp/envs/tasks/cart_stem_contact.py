@@ -241,4 +241,5 @@ class CartStemContact(SoftEnv):
         """Everything, the cart on the floor [m]."""
         config = self.config
         x, low = config.obstacle_x[1] + config.half_diagonal, -0.5 * config.cart_size[2]
-        return np.array([(-x, 0.0, low), (x, 0.0, low), (0.0, 0.0, config.length + config.radius)])
+        y = 0.5 * config.cart_size[1]  # towards the eye
+        return np.array([(-x, -y, low), (x, -y, low), (0.0, 0.0, config.length + config.radius)])

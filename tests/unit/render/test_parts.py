@@ -110,6 +110,19 @@ def rod_caster(**options):
     return RayCaster(**NOTHING, parts=parts, placed=placed, **SIZE, region=BELOW, **options), placed
 
 
+def test_a_rod_far_thinner_than_a_pixel_is_seen():
+    """Of 0.1 mm in a picture where a pixel is 20 mm: drawn two or three pixels wide, in a colour of its own."""
+    parts = Parts(rod_names=("rod",), rod_point_start=[0, 2], rod_radius=[1e-4] * 2)
+    x = np.array([[[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]])
+    placed = Placement(rod_x=x, rod_q=np.tile([0.0, np.sin(np.pi / 4), 0.0, np.cos(np.pi / 4)], (1, 2, 1)))
+    caster = RayCaster(**NOTHING, parts=parts, placed=placed, **SIZE, region=BELOW)
+    empty, seen = caster.render(no_nodes())[0], caster.render(no_nodes(), placed=placed)[0]
+    covered = differ(seen, empty)
+    assert (covered[:, 30:70].sum(axis=0) >= 2).all() and covered.any(axis=1).sum() <= 3
+    red, _, blue = seen[covered].mean(axis=0)
+    assert red > 2.0 * blue
+
+
 def test_a_rod_is_a_tube_of_its_radius():
     """It covers 10 pixels across and 50 along (a little more in front), and no others."""
     caster, placed = rod_caster()
