@@ -71,3 +71,22 @@ def check_choice(config: object, name: str, choices: tuple[str, ...]) -> None:
     value = getattr(config, name)
     if value not in choices:
         raise ValueError(f"{type(config).__name__}: unknown {name} {value!r}; {nearest(str(value), choices)}")
+
+
+def check_borne(config: Any, borne: float) -> None:
+    """Refuse a ``min_tension`` with which cables crush a body whatever they are told.
+
+    Args:
+        config: Options with ``min_tension`` [N] and ``youngs`` [Pa].
+        borne: Largest tension over modulus that the body bears [m^2].
+
+    Raises:
+        ValueError: With the largest tension.
+    """
+    most = borne * config.youngs
+    if config.min_tension > most:
+        raise ValueError(
+            f"{type(config).__name__}: min_tension must be at most {most:.3g} N, got {config.min_tension!r}: cables "
+            f"that never pull less crush a body whose youngs is {config.youngs:g} Pa; make youngs larger or "
+            "min_tension smaller"
+        )

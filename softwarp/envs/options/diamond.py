@@ -20,6 +20,7 @@ from softwarp.envs.options import (
     Positive,
     Rayleigh,
     Unlimited,
+    check_borne,
     check_choice,
     check_options,
 )
@@ -61,12 +62,7 @@ class DiamondSceneConfig:
                 f"DiamondConfig: min_displacement must be below max_displacement, got {self.min_displacement} and "
                 f"{self.max_displacement}"
             )
-        most = BORNE * self.youngs
-        if self.min_tension > most:
-            raise ValueError(
-                f"DiamondConfig: min_tension must be at most {most:.3g} N, got {self.min_tension!r}: cables that never "
-                f"pull less crush a body whose youngs is {self.youngs:g} Pa; make youngs larger or min_tension smaller"
-            )
+        check_borne(self, BORNE)
 
 
 @dataclass(kw_only=True)

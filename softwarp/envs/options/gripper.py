@@ -23,6 +23,7 @@ from softwarp.envs.options import (
     PositiveRange,
     Rayleigh,
     Speed,
+    check_borne,
     check_choice,
     check_options,
 )
@@ -47,6 +48,11 @@ LARGEST = 0.070  # m, what fits between the phalanges below the palms
 TIPS, CLOSING = 0.104, 6.6  # m, between the tips of open fingers; m less for a m of cable, at most, plain ones
 CRUSHED = 0.025  # m of cable: empty fingers have met by then; at 30 mm elements turn inside out
 EPISODE, ACTIONS = 12.5, 250  # s and actions of an ordinary episode, within which the task must be feasible
+BORNE = {
+    "cavities": 1.0e-5,
+    "plain": 5.0e-6,
+}  # m^2, tension over youngs that empty fingers bear: 200 N
+SUPPLE = 0.25  # times that for quadratic elements, which bend more easily
 CLEARANCE = 0.004  # m, between what must not touch at the start
 
 Growth = Annotated[tuple[float, float], Range(low=0.0, high=0.02, rising=True)]  # m
@@ -114,6 +120,7 @@ class GripperSceneConfig:
                 f"{label}: hand_z must begin at {CLOSED_DEPTH:g} m or higher, so that closing fingers pass "
                 f"above the floor, got {self.hand_z}"
             )
+        check_borne(self, BORNE[self.finger] * (SUPPLE if self.element == "p2" else 1.0))
         self._check_grasp(label)
 
     def _check_grasp(self, label: str) -> None:

@@ -23,6 +23,7 @@ from softwarp.envs.options import (
     Rayleigh,
     Share,
     Unlimited,
+    check_borne,
     check_choice,
     check_options,
 )
@@ -31,6 +32,7 @@ from softwarp.envs.options.fidelity import FidelityConfig
 
 ROTATIONS = ("large", "polar", "warped")
 ROUND = {"round": "coarse", "round fine": "fine"}  # meshes of ``meshing.round_trunk``, and their details
+BORNE = 4.45e-6  # m^2, tension of all cables over youngs: under 2 N the default trunk comes to rest, under 3 N never
 
 
 @dataclass(kw_only=True)
@@ -73,6 +75,7 @@ class TrunkSceneConfig(FidelityConfig):
         for low, high in zip(self.min_displacement, self.max_displacement, strict=True):
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"TrunkConfig: displacement limits must be finite and rising, got {low} and {high}")
+        check_borne(self, BORNE)
 
 
 @dataclass(kw_only=True)

@@ -22,6 +22,7 @@ class FakeSimulation:
         self.status = torch.zeros(num_worlds, dtype=torch.int32)
         self.time = torch.zeros(num_worlds)
         self.control = SimpleNamespace(target=torch.zeros(num_worlds, 2))
+        self.params = SimpleNamespace(cable_min_tension=torch.zeros(num_worlds, 0))
         self.corrupt = torch.zeros(num_worlds, dtype=torch.bool)
         self.node_v = torch.zeros(num_worlds, 1, 3)
         self.frame_pose, self.frame_twist = torch.zeros(num_worlds, 0, 7), torch.zeros(num_worlds, 0, 6)

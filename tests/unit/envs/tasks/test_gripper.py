@@ -309,6 +309,9 @@ def test_moment_on_a_soft_object_is_the_one_drawn():
 BAD = [
     ({"object_size": 0.08}, r"object_size must lie in \[0.032, 0.07\] m, what the hand can hold, got 0.08 m"),
     ({"object_size": 0.02}, "what the hand can hold, got 0.02 m"),
+    ({"min_tension": 1000.0, "settle": False}, "min_tension must be at most 200 N, got 1000.0"),
+    ({"min_tension": 150.0, "finger": "plain"}, "min_tension must be at most 100 N, got 150.0"),
+    ({"min_tension": 51.0, "element": "p2"}, "min_tension must be at most 50 N, got 51.0"),
     ({"object_growth": (0.0, 0.018)}, r"got 0.04 m with object_growth \(0.0, 0.018\)"),
     ({"hand_start": 0.1, "object_x": (-0.03, 0.03)}, "the object would start inside a finger"),
     ({"goal_z": (0.06, 0.3)}, r"goal_z must lie in \[0.02, 0.185\] m, between the object at rest and what the hand"),
