@@ -114,6 +114,15 @@ class Reduction:
         if len(self.modes) == 0 or (self.tets.size and not 0 <= self.tets.min() <= self.tets.max() < nodes):
             raise ValueError(f"reduction {self.name!r}: it needs a mode, and tets of its {nodes} nodes")
 
+    def __repr__(self) -> str:
+        """What it is of and how large; its arrays are for whoever asks for them."""
+        kept = int(np.count_nonzero(self.tet_weight))
+        of = "elements" if self.element == "p1" else "Gauss points"
+        return (
+            f"Reduction of body {self.name!r}: {len(self.modes)} modes of {len(self.nodes)} nodes in a {self.frame} "
+            f"frame, {kept} of {self.tet_weight.size} {of}"
+        )
+
     def _check_numbers(self) -> None:
         """Refuse counts and masses that no body has."""
         label, modes = f"reduction {self.name!r}", len(self.modes)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from softwarp import checks, notices
-from softwarp.model.codes import Status
+from softwarp.model.codes import CavityControl, Status
 from softwarp.reduction.packing import images
 from softwarp.simulation import Simulation
 
@@ -26,7 +26,7 @@ class Motion:
     Attributes:
         positions: All nodes of the scene [m], (snapshot, node, 3).
         travel: How far every actuator went in it, by the actuator's name: the range of a cable's displacement [m], of a
-            chamber's volume [m^3].
+            chamber's volume [m^3]; 0 where a commanded tension or pressure never changed, whatever others moved.
         touch: Forces of contacts at the nodes of soft bodies nearest to them [N], like positions; None without contact.
     """
 
@@ -100,8 +100,8 @@ class Watch:
         self.sim = sim
         self.parts: list[NDArray[np.float32]] = []
         self.touch: list[NDArray[np.float32]] = []
-        self.low: dict[str, float] = {}
-        self.high: dict[str, float] = {}
+        self.low: dict[str | tuple[str, str], float] = {}  # by the name of an actuator, and by that of its effort
+        self.high: dict[str | tuple[str, str], float] = {}
 
     def look(self) -> None:
         """Keep the present state of all worlds that have not failed."""
@@ -111,12 +111,18 @@ class Watch:
         if sim.model.contact is not None:
             self.touch.append(_touch(sim)[good].float().cpu().numpy())
         m = sim.model
-        for names, values in ((m.cable_names, sim.cable_displacement), (m.cavity_names, sim.cavity_volume)):
+        seen = ("cable", m.cable_names, sim.cable_displacement), ("chamber", m.cavity_names, sim.cavity_volume)
+        for kind, names, values in seen:
             for k, name in enumerate(names):
-                column = values[good, k]
-                if column.numel():
-                    self.low[name] = min(self.low.get(name, np.inf), float(column.min()))
-                    self.high[name] = max(self.high.get(name, -np.inf), float(column.max()))
+                self._stretch(name, values[good, k])
+                if (effort := _effort(sim, kind, k)) is not None:
+                    self._stretch((name, "effort"), effort[good])
+
+    def _stretch(self, key: str | tuple[str, str], column: torch.Tensor) -> None:
+        """Widen the range of what goes by a key."""
+        if column.numel():
+            self.low[key] = min(self.low.get(key, np.inf), float(column.min()))
+            self.high[key] = max(self.high.get(key, -np.inf), float(column.max()))
 
     def finish(self) -> Motion:
         """What was seen.
@@ -126,7 +132,8 @@ class Watch:
         """
         if not self.parts:
             raise ValueError("no state was recorded; look() at a running simulation first")
-        travel = {name: self.high[name] - self.low[name] for name in self.low}
+        way = {key: self.high[key] - self.low[key] for key in self.low}
+        travel = {key: way[key] if way.get((key, "effort"), 1.0) else 0.0 for key in way if isinstance(key, str)}
         return Motion(np.concatenate(self.parts), travel, np.concatenate(self.touch) if self.touch else None)
 
 
@@ -253,6 +260,17 @@ def _command(sim: Simulation, kind: str, number: int) -> torch.Tensor:
     assert sim.model.cavities is not None
     control = int(sim.model.cavities.cavity_control.numpy()[number])
     return commands[("cavity_pressure", "cavity_volume", "cavity_gas")[control]]
+
+
+def _effort(sim: Simulation, kind: str, number: int) -> torch.Tensor | None:
+    """Commanded tension or pressure, (world,), which moves nothing while it stays; None where a way is commanded."""
+    m = sim.model
+    if kind == "cable":
+        commands_effort = bool(m.cable_force_controlled[number])
+    else:
+        assert m.cavities is not None
+        commands_effort = int(m.cavities.cavity_control.numpy()[number]) == CavityControl.PRESSURE
+    return _command(sim, kind, number)[:, number] if commands_effort else None
 
 
 def _targets(

@@ -89,8 +89,8 @@ def check_parts(scene: Scene) -> None:
     """Refuse what reduced bodies cannot have, once the scene is complete.
 
     Raises:
-        ValueError: For held nodes that a mode moves, locked axes, nodes attached to frames, and membranes that the
-            reduction was not made with.
+        ValueError: For held nodes that a mode moves, a free body whose modes hold nodes, locked axes, nodes attached to
+            frames, and membranes that the reduction was not made with.
     """
     for number, spec in enumerate(scene.bodies):
         given = spec.reduction
@@ -108,6 +108,12 @@ def check_parts(scene: Scene) -> None:
             raise ValueError(
                 f"{label}: its modes move node {moved[0]}, which is fixed ({moved.size} such nodes); "
                 "train the reduction with the supports that the scene has"
+            )
+        still = np.flatnonzero((np.abs(given.modes) <= HELD * largest).all(axis=(0, 2)))
+        if still.size and not given.floating and not spec.fixed.any():
+            raise ValueError(
+                f"{label}: its modes hold {still.size} nodes in place, such as node {still[0]}, and nothing holds them "
+                "in the scene; fix them, or train the reduction with the supports that the scene has"
             )
         if spec.locked.any():
             raise ValueError(f"{label}: single axes of its nodes are fixed, which a reduced body cannot have")

@@ -12,7 +12,7 @@ import softwarp as sw
 from softwarp import meshing, reduction
 from softwarp.reduction import packing, training
 from softwarp.reduction.basis import orthonormal
-from tests.reduction_cases import BASE, CLAMPED, SLAB, every_node, reduced_by, run, scene, smooth_modes
+from tests.reduction_cases import AIR, BASE, CLAMPED, SLAB, every_node, reduced_by, run, scene, smooth_modes
 
 RIGID = {"none": 0, "translations": 3, "motions": 6}
 
@@ -435,6 +435,31 @@ def test_impossible_reductions_are_refused(case):
     assert "slab" in str(caught.value)
 
 
+def test_modes_that_hold_a_free_body_are_refused():
+    """In a scene without the supports of the training it would hang in the air."""
+    builder = scene(held=False, contact=False)
+    builder.reduce(0, reduced_by(smooth_modes(held=True)))
+    with pytest.raises(ValueError, match=r"body 'slab': its modes hold .* nothing holds them in the scene; fix them"):
+        builder.finalize()
+
+
+def test_an_effort_that_never_changes_moves_nothing():
+    """A chamber at a constant pressure, and a cable at a constant tension, have not moved, though the body has."""
+    builder = sw.ModelBuilder()
+    body = builder.add_tets(SLAB, material=sw.Corotational(1e5, 0.3), density=1e3, rayleigh=(1.0, 0.01), name="slab")
+    builder.fix(body, nodes=np.flatnonzero(CLAMPED))
+    shell = meshing.compact(AIR.nodes + (0.01, 0.005, 0.003), AIR.surface())
+    builder.add_cavity(body, *shell, control="pressure", name="air")
+    builder.add_cable(body, [(x, 0.015, 0.009) for x in (0.06, 0.03, 0.0)], control="force", name="cable")
+    sim = simulation(builder)
+    sim.control.cable_tension[:] = 0.1
+    assert reduction.record(sim, lambda sim, step: None, 4, every=2).travel == {"air": 0.0, "cable": 0.0}
+    told = reduction.record(sim, lambda sim, step: sim.control.cavity_pressure.fill_(100.0 * step), 4, every=2)
+    assert told.travel["air"] > 0.0 and told.travel["cable"] == 0.0
+    with pytest.raises(ValueError, match="'cable' did not move in it"):
+        reduction.train(sim, told)
+
+
 def test_what_is_no_reduction_is_refused():
     """A file's name is not read: the message says what reads it."""
     for wrong in ("body.npz", None, 3):
@@ -454,7 +479,8 @@ def test_other_elements_and_relaxing_bodies_are_refused():
 
 def test_training_refuses_motion_that_says_too_little(trained):
     """Still actuators, other scenes, motion without deformation, tolerances that are none."""
-    motion, _, _ = trained
+    motion, small, _ = trained
+    assert len(repr(small)) < 120 and "of body 'slab'" in repr(small)
     sim = simulation(scene(held=True, contact=False), 2)
     with pytest.raises(ValueError, match="'air' did not move"):
         reduction.train(sim, replace(motion, travel={"cable": 0.004, "air": 0.0}))
