@@ -357,6 +357,7 @@ def test_config_composes_with_omegaconf():
         ({"action_kind": "contnuous"}, r"unknown action_kind 'contnuous'.*'continuous'"),
         ({"mesh": "corse"}, r"trunk mesh 'corse' is neither a file nor one of.*'coarse'"),
         ({"youngs_range": (5.0, 1.0)}, "youngs_range must be"),
+        ({"goals": "list", "goal_list": [[0.0, 0.0, 0.1], [0.0, 0.0, 9.0]]}, r"goal_list must lie within 0\.\d+ m of"),
         ({"min_tension": 10.0}, r"min_tension must be at most 2 N, got 10.0: .* youngs is 450000 Pa; make"),
         ({"min_tension": 2.0, "element": "p2"}, r"NONFINITE.*loads \(a min_tension of 2 N pulls all the time\)"),
         ({"goal_list": [[0.1, 0.2]]}, r"goal_list must hold points \(x, y, z\)"),

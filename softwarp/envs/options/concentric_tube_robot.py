@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -114,6 +115,12 @@ class ConcentricTubeRobotConfig(ConcentricTubeSceneConfig, TubesConfig):
         self.goal_list = [[float(x) for x in point] for point in self.goal_list]
         if not self.goal_list or any(len(point) != 3 for point in self.goal_list):
             raise ValueError(f"{name}: goal_list must hold points (x, y, z) in metres, got {self.goal_list}")
+        far = max(self.goal_list, key=lambda point: math.hypot(*point))
+        if self.goals == "list" and math.hypot(*far) > max(self.max_length):
+            raise ValueError(
+                f"{name}: points of goal_list must lie within max_length of the port, {max(self.max_length):g} m, so "
+                f"that a tube reaches them, got {far}; goals='workspace' has only such"
+            )
 
     @classmethod
     def paper(cls, **options: Any) -> ConcentricTubeRobotConfig:

@@ -37,6 +37,7 @@ from softwarp.envs.options.cable_reach import CableReachConfig
 COMPACT_LIMIT = 10.0
 STREAM_GOAL = 0  # of random numbers; tasks have their own from 1 on
 _TRAIN_FRACTION = 0.8
+STRETCH = 1.1  # times its length at rest: how far from where it is held a robot may reach at best
 
 Compact = Sequence[tuple[str, int, float]]  # name, entries, divisor to order 1
 
@@ -111,8 +112,23 @@ class CableReach(SoftEnv):
     def listed_or_reachable(self, reachable: np.ndarray) -> Tensor:
         """``goal_list``, or the part of the reachable points (point, 3) that ``goal_split`` names."""
         if self.config.goals == "list":
+            self._check_reach(np.array(self.config.goal_list))
             return torch.tensor(self.config.goal_list, dtype=torch.float32)
         return torch.from_numpy(split_part(reachable, self.config.goal_split).copy())
+
+    def _check_reach(self, goals: np.ndarray) -> None:
+        """Refuse goals [m] that lie farther from where the body is held than it could stretch."""
+        model = self.sim.model
+        rest = np.asarray(model.node_rest, dtype=np.float64)
+        root = rest[np.asarray(model.node_fixed, dtype=bool)].mean(axis=0)
+        reach = STRETCH * np.linalg.norm(rest - root, axis=1).max()
+        away = np.linalg.norm(goals - root, axis=1)
+        if (away > reach).any():
+            goal, place = goals[away.argmax()].tolist(), [round(float(c), 4) for c in root]
+            raise ValueError(
+                f"{type(self.config).__name__}: points of goal_list must lie within {reach:.3g} m of {place}, where "
+                f"the robot is held, so that it reaches them, got {goal}; goals='workspace' has only such"
+            )
 
     @property
     def action_size(self) -> int:

@@ -49,7 +49,8 @@ class Overlap:
     def __str__(self) -> str:
         """One line for an error message."""
         inside = "the centre of one lies inside the other" if self.is_engulfed else f"more than {self.limit:.3g} m"
-        return f"{self.a!r} and {self.b!r} overlap by {self.depth:.3g} m at the start ({inside}); move them apart"
+        by = f" by {self.depth:.3g} m" if self.depth > 0.0 else ""  # none where no surface cuts the other
+        return f"{self.a!r} and {self.b!r} overlap{by} at the start ({inside}); move them apart"
 
 
 def initial_overlaps(scene: CollisionScene, topology: Topology, x: ArrayLike, pose: ArrayLike) -> list[Overlap]:

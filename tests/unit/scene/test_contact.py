@@ -165,3 +165,14 @@ def test_nothing_starts_in_a_closed_chamber() -> None:
     builder.add_contact(hollow(builder), builder.add_rigid(sw.Sphere(0.005), mass=0.1, pose=(0.0, 0.0, -0.012)))
     with pytest.raises(ValueError, match="the centre of one lies inside the other"):
         builder.finalize()
+
+
+def test_a_ball_within_a_cube_overlaps_by_no_number():
+    """Where no surface cuts the other there is no depth to tell: 0 m would read as if they did not overlap."""
+    builder = sw.ModelBuilder()
+    mesh = meshing.box((0.04,) * 3, (2,) * 3)
+    cube = builder.add_tets(mesh, material=sw.Corotational(1e5, 0.4), density=1e3, name="cube")
+    ball = builder.add_rigid(sw.Sphere(0.02), mass=0.1, pose=(0.02, 0.02, 0.02), name="ball")
+    builder.add_contact(cube, ball)
+    with pytest.raises(ValueError, match=r"'cube' and 'ball' overlap at the start \(the centre of one lies inside"):
+        builder.finalize()

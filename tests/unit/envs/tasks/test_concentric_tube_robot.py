@@ -199,6 +199,7 @@ def test_bad_options() -> None:
         ({"first_lengths": (0.2, 0.0, 0.0)}, r"first_lengths of tube 0 must be at most max_length\[0\]"),
         ({"goals": "somewhere"}, "unknown goals"),
         ({"goal_list": [[0.0, 1.0]], "goals": "list"}, "goal_list"),
+        ({"goal_list": [[0.5, 0.5, 0.5]], "goals": "list"}, "must lie within max_length of the port"),
     ):
         with pytest.raises(ValueError, match=told):
             ConcentricTubeRobotConfig(**options)  # type: ignore[arg-type]

@@ -223,6 +223,7 @@ def test_config_composes_with_omegaconf():
         ({"action_kind": "contnuous"}, r"unknown action_kind 'contnuous'.*'continuous'"),
         ({"mesh": "corse"}, r"diamond mesh 'corse' is neither a file nor one of.*'coarse'"),
         ({"youngs_range": (5.0, 1.0)}, "youngs_range must be"),
+        ({"goals": "list", "goal_list": [[0.0, 0.0, 9.0]]}, "so that it reaches them, got"),
         ({"goal_list": [[0.1, 0.2]]}, r"goal_list must hold points \(x, y, z\)"),
         ({"goals": "list", "goal_list": [[0.0, math.nan, 0.1]]}, r"goal_list\[0\]\[1\] must lie in .*, got nan"),
         ({"start_displacement": (0.01,)}, "start_displacement must hold 4 lengths"),
