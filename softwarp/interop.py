@@ -85,7 +85,9 @@ class Views:
         if name in aliases:
             return aliases[name]  # type: ignore[no-any-return]
         names = [*tensors, *aliases]
-        near = close_to(name, names) or sorted(names)
+        same = [other for other in names if other.partition("_")[0] == name.partition("_")[0]]  # of the same part
+        near = [*close_to(name, same, cutoff=0.0, count=2), *close_to(name, names)] or sorted(names)
+        near = list(dict.fromkeys(near))
         raise AttributeError(f"{self._owner} has no {name!r}; did you mean {', '.join(near)}?")
 
     def __setattr__(self, name: str, value: Any) -> None:

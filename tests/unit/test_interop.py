@@ -35,3 +35,15 @@ def test_no_garbage_is_collected_during_a_capture(was_on):
         assert gc.isenabled() is was_on
     finally:
         gc.enable()
+
+
+def test_a_name_that_is_not_there_is_answered_with_those_of_its_part():
+    """Before names that look alike and belong to others; without any such, with all."""
+    names = ("body_force", "cable_displacement", "cable_tension", "node_force")
+    views = interop.Views("sim.control", {name: torch.zeros(1) for name in names})
+    with pytest.raises(AttributeError, match="did you mean cable_tension, cable_displacement, node_force"):
+        _ = views.cable_force
+    with pytest.raises(AttributeError, match="did you mean node_force"):
+        _ = views.node_forces
+    with pytest.raises(AttributeError, match="'bla'; did you mean body_force, cable_displacement"):
+        _ = views.bla
