@@ -67,6 +67,15 @@ def test_quadratic_elements_and_cables_that_stretch(law: str) -> None:
     check(Rollout(sim), inputs(sim, [2], 0.3), weights(sim))
 
 
+@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
+@pytest.mark.parametrize("refinement", [0, 2])
+def test_refinement(refinement: int, integrator: str) -> None:
+    """Passes of the linear solve, none or two, and as many of its adjoint."""
+    options: dict[str, Any] = {"locked": False, **EXACT} if integrator == "bdf2" else {"elastic": True}
+    sim = cube("nh_log", refinement=refinement, integrator=integrator, **options)
+    check(Rollout(sim), inputs(sim, [1]), weights(sim))
+
+
 def test_gradients_of_the_exact_tangent() -> None:
     """Without projection, A has negative eigenvalues of elements in it."""
     sim = cube("nh_log", project_tangent=False)
