@@ -197,13 +197,8 @@ class Trunk(FreeReach):
         return super().reward_terms(action, distance)
 
     def shown_region(self) -> NDArray[np.float64] | None:
-        """The trunk at rest beside its goals, which lie wherever the tip comes, and the floor with its shadow [m]."""
-        if self.config.goals == "list":
-            return None
-        rest = np.asarray(self.sim.model.node_rest, dtype=np.float64)
-        below = rest.copy()
-        below[:, 1] = min(rest[:, 1].min(), float(self._goal_table[:, 1].min()))
-        return np.concatenate([rest, below])
+        """The trunk at rest beside its goals, which lie wherever the tip comes [m]."""
+        return None if self.config.goals == "list" else np.asarray(self.sim.model.node_rest, dtype=np.float64)
 
 
 def observation_layout(kind: str) -> tuple[dict[str, slice], float]:
