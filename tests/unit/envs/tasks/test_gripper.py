@@ -355,15 +355,17 @@ def test_options_at_the_edge_are_taken():
 @pytest.mark.slow
 @pytest.mark.parametrize("finger", ["cavities", "plain"])
 def test_fingers_bear_the_largest_pull_that_is_taken(finger):
-    """At 25 mm of cable no step fails and no element is inside out."""
+    """At 25 mm of cable no step fails and no element is inside out; then the fingers meet and give some of it back."""
     env = make(1, finger=finger, max_displacement=0.025)
     env.reset()
     action = torch.zeros(1, env.action_size)
     action[:, -1] = 1.0
+    largest = torch.zeros(1, 2)
     for _ in range(40):
         data = env.step(env.reset_where(torch.tensor([False])).set("action", action))["next"]
         assert data["world_status"].item() < 3 and env.sim.inverted_count.item() == 0
-    assert env.sim.cable_displacement.min() > 0.02
+        largest = torch.maximum(largest, env.sim.cable_displacement)
+    assert largest.min() > 0.0249
 
 
 @pytest.mark.slow
