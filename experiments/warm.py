@@ -15,6 +15,7 @@ from pathlib import Path
 
 import warp as wp
 
+from softwarp import cli
 from softwarp.envs import registry
 from softwarp.processes import serve_parent
 from softwarp.threads import begin
@@ -39,11 +40,11 @@ def main(arguments: Sequence[str]) -> int:
     jobs = cores if args.jobs is None else args.jobs
     if jobs < 1:
         raise ValueError(f"--jobs must be at least 1, got {args.jobs}")
-    folder = str(args.cache.resolve()) if args.cache else wp.config.kernel_cache_dir
+    folder = str(args.cache.resolve()) if args.cache else None
     start = time.perf_counter()
     spawn = get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=serve_parent) as pool:
-        running = {pool.submit(compile_for, name, args.device, WORLDS[kind], folder): name for name in names}
+        running = {pool.submit(cli.compile_for, name, args.device, WORLDS[kind], folder): name for name in names}
         try:
             for done in as_completed(running):
                 print(f"{running[done]:<22}{done.result():6.1f} s", flush=True)
@@ -51,13 +52,18 @@ def main(arguments: Sequence[str]) -> int:
             for process in active_children():  # in the middle of a kernel, which the next run compiles again
                 process.terminate()
             raise
-    print(f"{'all together':<22}{time.perf_counter() - start:6.1f} s; kernels are in {folder}")
+    where = folder or wp.config.kernel_cache_dir
+    print(f"{'all together':<22}{time.perf_counter() - start:6.1f} s; kernels are in {where}")
     return 0
 
 
-def compile_for(name: str, device: str, worlds: Sequence[int], folder: str) -> float:
-    """Seconds until an environment has taken two steps with each number of worlds; runs in a process of its own."""
-    wp.config.kernel_cache_dir = folder
+def compile_for(name: str, device: str, worlds: Sequence[int], folder: str | None) -> float:
+    """Seconds until an environment has taken two steps with each number of worlds; runs in a process of its own.
+
+    ``folder`` is a cache other than Warp's own, to which Warp appends its version: that of this process has it already.
+    """
+    if folder is not None:
+        wp.config.kernel_cache_dir = folder
     start = time.perf_counter()
     for count in worlds:
         env = registry.make(name, num_worlds=count, device=device, seed=0)

@@ -244,6 +244,12 @@ def warm(arguments: list[str]) -> int:
     return _code(experiment("warm").main(arguments))
 
 
+def compile_for(*given: Any) -> float:
+    """Compile one environment's kernels, in a process of ``warm``, which finds ``experiments/`` as this one does."""
+    seconds: float = experiment("warm").compile_for(*given)
+    return seconds
+
+
 def new(arguments: list[str]) -> int:
     """Write a package with a robot of your own, which runs as it is."""
     return _code(experiment("new").main(arguments))

@@ -145,13 +145,14 @@ def test_warm_of_an_unknown_environment(tmp_path):
 
 @pytest.mark.slow
 def test_warm_fills_a_cache(tmp_path):
-    """Kernels of one world and of lanes are kept, and another process finds all it needs there."""
+    """Kernels of one world and of lanes are kept, and another process finds all it needs there, named or Warp's own."""
     cache = tmp_path / "cache"
     softwarp("warm", "CartPole", "--cache", cache, "--jobs", "1", cwd=tmp_path, check=0)
     kept = sorted(path.name for path in cache.rglob("wp_softwarp*"))
     assert any("cholesky_wide.scalar_f32" in name for name in kept)
     assert any("cholesky.lanes_f32" in name for name in kept)
     softwarp("warm", "CartPole", "--cache", cache, "--jobs", "1", cwd=tmp_path, check=0)
+    softwarp("warm", "CartPole", "--jobs", "1", cwd=tmp_path, check=0, WARP_CACHE_PATH=str(cache))
     assert sorted(path.name for path in cache.rglob("wp_softwarp*")) == kept
 
 
