@@ -69,7 +69,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Contacts of one world from its hits; each finds its predecessor, as both lists ascend.
 
         If there are too many, those that touch already go before those that might touch within the step. What waits
-        goes into the reserve, which has as much room.
+        goes into the reserve, which has as much room. Of a step's lists the one that left out most tells how many.
         """
         pack, lane = wp.tid()
         total = int(0)
@@ -131,7 +131,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         listed_out[pack, 0, lane] = count
         count_out[pack, 0, lane] = count
         kept = wp.min(waiting, capacity)
-        overflow_out[pack, 0, lane] = total - count - kept
+        overflow_out[pack, 0, lane] = wp.max(overflow_out[pack, 0, lane], total - count - kept)
         reserve_count_out[pack, 0, lane] = kept
         for c in range(count, capacity):
             key_out[pack, c, lane] = -1
@@ -351,12 +351,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         known_count_out: wp.array3d(dtype=wp.int32),
         known_key_out: wp.array3d(dtype=wp.int32),
         known_force_out: wp.array3d(dtype=real),
+        overflow_out: wp.array3d(dtype=wp.int32),
     ):
-        """Remembered contacts from the state; lanes past the last world repeat it."""
+        """Remembered contacts from the state, and none left out so far; lanes past the last world repeat it."""
         pack, c, lane = wp.tid()
         world = wp.min(pack * lanes + lane, world_count - 1)
         if c == 0:
             known_count_out[pack, 0, lane] = count_in[world, 0]
+            overflow_out[pack, 0, lane] = 0
         known_key_out[pack, c, lane] = key_in[world, c]
         for i in range(3):
             known_force_out[pack, 3 * c + i, lane] = force_in[world, 3 * c + i]

@@ -435,7 +435,7 @@ class Detector:
     def load(self, count: wp.array, key: wp.array, force: wp.array) -> None:
         """Take the first guess from the state, arrays (world, row)."""
         inputs = [count, key, force, self.world_count, self.lanes]
-        outputs = [self.known_count.real, self.known_key.real, self.known_force.real]
+        outputs = [self.known_count.real, self.known_key.real, self.known_force.real, self.contacts.overflow.real]
         self._launch(self.k_list.load, self.capacity, inputs, outputs)
 
     def store(self, flag: Rows, count: wp.array, key: wp.array, force: wp.array) -> None:
