@@ -303,7 +303,7 @@ class Detector:
             waiting = (self.none, self.reserve_count, self.reserve_key, self.reserve_couple, self.reserve_face)
             self._measure(self.places(*end, *at), waiting, self.reserve_touch, is_found=False)
             inputs = [self.scene.couple, self.capacity, self.reserve_key.real, self.reserve_couple.real]
-            inputs += [self.reserve_face.real, self.reserve_touch.real, pairs.distance.real]
+            inputs += [self.reserve_face.real, self.reserve_touch.real, pairs.distance.real, c.idle.real]
             outputs = [self.reserve_count.real, c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
             outputs += [self.couple.real, self.face.real, self.known.real]
             self._launch(self.k_list.call_up, None, inputs, outputs)
