@@ -418,10 +418,11 @@ class Detector:
         self._launch(self.k_shape.find, a.shape_chunks.size, inputs, [*outputs, *found])
         if self.k_sift is not None and a.tracked_chunks.size:
             inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
-            inputs += [self.moved.real, self.chunk_hits.real, self.sought.real, self.room.real]
+            inputs += [self.moved.real, laws[0], ahead < 0.0, self.chunk_hits.real, self.sought.real, self.room.real]
             wp.launch(self.k_sift.sift, dim=(self.packs, a.tracked_chunks.size), inputs=inputs, device=self.device)
-        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real, self.sought.real, self.k_sift is not None]
-        self._launch(self.k_surface.find, a.surface_chunks.size, inputs, [*outputs, self.room.real])
+        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real, self.k_sift is not None]
+        outputs = [self.sought.real, *outputs, self.room.real]
+        self._launch(self.k_surface.find, a.surface_chunks.size, inputs, outputs)
 
     # Memory
 
