@@ -116,7 +116,8 @@ def _contacts(sim: Simulation) -> Iterator[str]:
     scene, passes = contact.scene, sim.options.contact_passes
     if passes > 0 and max(passes, sim.options.refinement) + sim.options.further_passes > 1:
         told = f"contact that is measured anew more than once a step (contact_passes={passes}, "
-        told += f"refinement={sim.options.refinement}) has no gradient yet"
+        further = f"{sim.options.further_passes} more in worlds that still move, " if sim.options.further_passes else ""
+        told += f"{further}refinement={sim.options.refinement}) has no gradient yet"
         yield f"{told}; take contact_passes=1, or 0, and refinement=1, or 0"
     if passes > 0 and sim.model.joints is not None:
         yield "contact that is measured anew beside joints has no gradient yet; take contact_passes=0"

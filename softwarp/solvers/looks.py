@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from softwarp.kernels.rows import looks
 from softwarp.model import memory
-from softwarp.model.codes import FAR
+from softwarp.model.codes import FAR, CoupleColumn
 from softwarp.model.model import Model
 from softwarp.solvers.response import ContactResponse
 from softwarp.solvers.terms.contact import ContactTerm
@@ -25,16 +25,23 @@ from softwarp.solvers.workspace.shard import Shard
 
 SKIN = 0.1  # radii of a line that a correction may move it by without a further look
 MOST = 3  # looks of a step in scenes with telescopes
+SOFT_SKIN = 0.25  # edges of a usual element that a correction may move soft bodies by that touch each other
 
 
 def chosen_looks(model: Model) -> dict[str, Any]:
     """Looks at contacts that a scene needs: ``Options`` by name.
 
     One, and up to three for lines of telescopes, which snap across a lumen within a step. Beside joints and reduced
-    bodies, which are corrected in every pass, all worlds take all three.
+    bodies, which are corrected in every pass, all worlds take all three. Two where soft bodies meet each other: a look
+    may give way to what the one before held back, and a wall be thinner than that.
     """
-    if model.telescopes is None or model.contact is None or model.frames is None:
+    if model.contact is None:
         return {"contact_passes": 1}
+    if model.telescopes is None or model.frames is None:
+        soft = model.contact.scene.couple_table()[:, CoupleColumn.TRACKED].any()
+        if not soft or model.joints is not None or model.reduction is not None:
+            return {"contact_passes": 1}
+        return {"contact_passes": 1, "further_passes": 1, "skin": SOFT_SKIN * usual_edge(model)}
     if model.joints is not None or model.reduction is not None:
         return {"contact_passes": MOST}
     skin = SKIN * least_radius(model)
@@ -45,6 +52,13 @@ def least_radius(model: Model) -> float:
     """The smallest contact radius of the lines of telescopes [m]; there must be some."""
     assert model.telescopes is not None and model.frames is not None
     return min(float(model.frames.rod_radius[model.rod_nodes(rod)].min()) for rod in model.telescopes.rod)
+
+
+def usual_edge(model: Model) -> float:
+    """Edge of a regular tetrahedron with the median volume of the model's elements [m]."""
+    whole = [] if model.quadratic is None else [model.quadratic.point_volume.numpy()]
+    volume = np.abs(np.concatenate([model.tet_volume.numpy(), *whole]))
+    return float(np.cbrt(6.0 * np.sqrt(2.0) * np.median(volume)))
 
 
 class FurtherLooks:

@@ -247,7 +247,7 @@ class ContactMultipliers(Multipliers):
             end=end,
         )
         sweeps, tolerance = o.gauss_seidel_iterations, o.gap_tolerance(s.model.extent, x_scale)
-        if self.further is not None and not is_first:
+        if self.further is not None and s.model.telescopes is not None and not is_first:
             sweeps = min(sweeps, FURTHER_SWEEPS)
         bounds, extent = (w.lower_bound, w.upper_bound), s.model.extent
         laws.solve(*bounds, w.multiplier, sweeps=sweeps, tolerance=tolerance, extent=extent)

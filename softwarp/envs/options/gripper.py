@@ -52,6 +52,7 @@ BORNE = {
     "cavities": 1.0e-5,
     "plain": 5.0e-6,
 }  # m^2, tension over youngs that empty fingers bear: 200 N
+SQUEEZE = 4.0e-6  # m^2, normal force of a finger over its youngs, at most: 78 N on an object 70 mm wide
 SUPPLE = 0.25  # times that for quadratic elements, which bend more easily
 CLEARANCE = 0.004  # m, between what must not touch at the start
 
@@ -149,6 +150,14 @@ class GripperSceneConfig:
             raise ValueError(
                 f"{label}: contact_distance must be less than {room:.3g} m, the room between an object "
                 f"{self.width[1]:g} m wide and the open fingers, got {self.contact_distance:g}"
+            )
+        weight, grip = self.object_mass[1] * math.hypot(*self.gravity), 2.0 * SQUEEZE * self.youngs
+        least = max(math.ceil(1.0e4 * weight / grip), 1.0) / 1.0e4
+        if self.mu[0] < least:
+            raise ValueError(
+                f"{label}: mu must begin at {least:g} or higher, got {self.mu}: nothing but friction lifts an object, "
+                f"and fingers whose youngs is {self.youngs:g} Pa press {self.object_mass[1]:g} kg by no more "
+                f"than {0.5 * grip:.3g} N each; make mu or youngs larger, or object_mass smaller"
             )
         across, down = math.hypot(*self.gravity[:2]), -self.gravity[2]
         if down < 0.0 or across > self.mu[0] * down:

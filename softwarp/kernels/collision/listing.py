@@ -151,6 +151,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         reserve_face_in: wp.array3d(dtype=wp.int32),
         reserve_touch_in: wp.array3d(dtype=real),
         pair_distance_in: wp.array3d(dtype=real),
+        idle_in: wp.array3d(dtype=wp.int32),
         # Workspace out
         reserve_count_out: wp.array3d(dtype=wp.int32),
         first_out: wp.array3d(dtype=wp.int32),
@@ -164,7 +165,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Append one world's reserve, from ``first`` on, if any of it overlaps at the end of the step; once a step.
 
-        All of it, because nothing looks again at where the step leads with those alone. Else it goes on waiting.
+        All of it, because nothing looks again at where the step leads with those alone. Else it goes on waiting, as it
+        does in idle worlds, which keep their contacts.
         """
         pack, lane = wp.tid()
         count = count_out[pack, 0, lane]
@@ -173,7 +175,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for r in range(reserve_count_out[pack, 0, lane]):
             pair = couple[reserve_couple_in[pack, r, lane], wp.static(CoupleColumn.PAIR)]
             end = reserve_touch_in[pack, wp.static(TOUCH_ROWS) * r + wp.static(DISTANCE), lane]
-            if end < pair_distance_in[pack, pair, lane]:
+            if end < pair_distance_in[pack, pair, lane] and idle_in[pack, 0, lane] == 0:
                 needed = True
         missed = int(0)
         if needed:

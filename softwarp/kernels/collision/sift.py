@@ -17,6 +17,7 @@ from softwarp.kernels.collision.faces import SHARP
 from softwarp.model.codes import FAR, CoupleColumn
 
 FARTHER = 1.001  # what a feature must be away from a target, in distances within which it may touch, to be left alone
+OUTSIDE = 2  # mark of a point whose last search found it outside its target
 AHEAD = 4.0  # motions that the search of an edge looks ahead, so that the next ones can be left out
 MARGIN = 1.0e-3  # by which this looks farther, relative to distances, squares and sines
 ROUNDING = 1.0e-5  # likewise, relative to coordinates: of distances that two ways of computing find
@@ -230,9 +231,11 @@ auto nearest = [&](const lane_t (&p)[3], mask_t wanted, lane_t bound) -> lane_t 
 
 # The features of one chunk: those of near couples, not apart from the box of the target, which may have come within
 # reach since their last search; of edges those that may meet a side, of points those that have a face within reach, how
-# far away then stands in ``room``.
+# far away then stands in ``room``. Where a look asks for what is too near only, points that were outside and cannot
+# have come to the surface since are left alone.
 _CHUNK = f"""
 const lane_t reach = row(&wp::index(reach_in, pack, couple, 0), 0);
+const lane_t touching = least(reach, most(row(&wp::index(distance_in, pack, pair, 0), 0), lane_t{{}}));
 const lane_t way = row(&wp::index(moved, pack, object_a, 0), 0) + row(&wp::index(moved, pack, object_b, 0), 0);
 const float* const target = &wp::index(box_in, pack, 7 * object_b, 0);
 float* const room = &wp::index(room_out, pack, 0, 0);
@@ -258,7 +261,10 @@ for (int key = begin; key < end; key += packed ? 1 : lanes) {{
     lane_t left = {{}};
     __builtin_memcpy(&left, room + WORLDS * key, 4 * count);
     left -= way;
-    mask_t wanted = (mask_t)(reach >= 0.0f) & ~(mask_t)(left > {FARTHER}f * (reach + radius + space));
+    mask_t before = {{}};
+    __builtin_memcpy(&before, sought + WORLDS * key, 4 * count);
+    const lane_t within = is_late && !edges ? before == {OUTSIDE} ? touching : reach : reach;
+    mask_t wanted = (mask_t)(reach >= 0.0f) & ~(mask_t)(left > {FARTHER}f * (within + radius + space));
     if (any(wanted)) {{
         lane_t p0[3], p1[3];
         place(point[0], p0);
@@ -309,6 +315,7 @@ def kernels(worlds: int) -> SimpleNamespace:
         couple: int,
         object_a: int,
         object_b: int,
+        pair: int,
         begin: int,
         end: int,
         offset: int,
@@ -316,6 +323,7 @@ def kernels(worlds: int) -> SimpleNamespace:
         root: int,
         last: int,
         deepest: float,
+        is_late: bool,
         point_index: wp.array(dtype=wp.int32),
         point_inset: wp.array(dtype=wp.vec3),
         point_axis: wp.array(dtype=wp.vec3),
@@ -335,6 +343,7 @@ def kernels(worlds: int) -> SimpleNamespace:
         box_in: wp.array3d(dtype=wp.float32),
         reach_in: wp.array3d(dtype=wp.float32),
         moved: wp.array3d(dtype=wp.float32),
+        distance_in: wp.array3d(dtype=wp.float32),
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         sought_out: wp.array3d(dtype=wp.int32),
         room_out: wp.array3d(dtype=wp.float32),
@@ -352,12 +361,17 @@ def kernels(worlds: int) -> SimpleNamespace:
         box_in: wp.array3d(dtype=wp.float32),
         reach_in: wp.array3d(dtype=wp.float32),
         moved_in: wp.array3d(dtype=wp.float32),
+        pair_distance_in: wp.array3d(dtype=wp.float32),
+        is_late: bool,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         sought_out: wp.array3d(dtype=wp.int32),
         room_out: wp.array3d(dtype=wp.float32),
     ):
-        """Mark the keys of one chunk of a tracked couple that must be searched, and the chunks that have any."""
+        """Mark the keys of one chunk of a tracked couple that must be searched, and the chunks that have any.
+
+        ``is_late`` asks for what is nearer than the contact distance only, and follows a search of this step.
+        """
         pack, item = wp.tid()
         chunk = chunk_list[item]
         couple = chunk_couple[chunk]
@@ -371,6 +385,7 @@ def kernels(worlds: int) -> SimpleNamespace:
             couple,
             scene.couple[couple, wp.static(CoupleColumn.OBJECT_A)],
             scene.couple[couple, wp.static(CoupleColumn.OBJECT_B)],
+            scene.couple[couple, wp.static(CoupleColumn.PAIR)],
             chunk_key[chunk],
             chunk_key[chunk + 1],
             scene.couple[couple, wp.static(CoupleColumn.FIRST)] - scene.couple[couple, wp.static(CoupleColumn.KEY)],
@@ -378,6 +393,7 @@ def kernels(worlds: int) -> SimpleNamespace:
             scene.target_tree[target, 0],
             scene.target_tree[target, 1],
             deepest,
+            is_late,
             scene.point_index,
             scene.point_inset,
             scene.point_axis,
@@ -397,6 +413,7 @@ def kernels(worlds: int) -> SimpleNamespace:
             box_in,
             reach_in,
             moved_in,
+            pair_distance_in,
             chunk_hits_out,
             sought_out,
             room_out,

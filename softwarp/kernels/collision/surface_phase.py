@@ -12,7 +12,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, touches
 from softwarp.kernels.collision.shapes_phase import UNSURE
-from softwarp.kernels.collision.sift import AHEAD, FARTHER
+from softwarp.kernels.collision.sift import AHEAD, FARTHER, OUTSIDE
 from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
 
 
@@ -315,9 +315,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         ahead: real,
         moved_in: wp.array3d(dtype=real),
-        sought_in: wp.array3d(dtype=wp.int32),
         is_sifted: bool,
         # Workspace out
+        sought_out: wp.array3d(dtype=wp.int32),
         chunk_hits_out: wp.array3d(dtype=wp.int32),
         hit_out: wp.array3d(dtype=wp.int32),
         room_out: wp.array3d(dtype=real),
@@ -326,7 +326,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         Features of tracked couples are left alone as long as they cannot have come within reach since their last
         search: ``room`` is a distance that the target is not nearer than, less by all that both have moved since. Which
-        these are is known where ``sift`` has looked.
+        these are is known where ``sift`` has looked; points that were searched and found outside are marked for it.
         """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
@@ -371,7 +371,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     slot += 1
                 is_far = bool(False)
                 if sifted:
-                    is_far = sought_in[pack, key, lane] == 0
+                    is_far = sought_out[pack, key, lane] == 0
                 else:
                     is_far = is_outside(scene, motion, pack, lane, edges, feature, centre, extent, none, reach)
                     if is_tracked and not is_far:
@@ -430,6 +430,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         hits += found
                         if is_tracked:
                             room_out[pack, key, lane] = room
+                        if sifted and not edges:
+                            if room > real(0.0) and room < feature_reach(scene, edges, feature, reach):
+                                sought_out[pack, key, lane] = wp.static(OUTSIDE)
                 key += width
         chunk_hits_out[pack, chunk, lane] = hits
 

@@ -413,27 +413,28 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
             gap_out[pack, i + 1, lane] = real(0.0)
             gap_out[pack, i + 2, lane] = real(0.0)
             return
+        restitution = restitution_in[pack, contact, lane]
         before = real(0.0)
         slip = vec3()
         for slot in range(int(wp.static(SLOTS))):
             dof = dof_in[pack, wp.static(SLOTS) * contact + slot, lane]
             if dof >= 0:
                 t = 3 * dof
-                v0 = vec3(v0_in[pack, t, lane], v0_in[pack, t + 1, lane], v0_in[pack, t + 2, lane])
                 v = vec3(v_in[pack, t, lane], v_in[pack, t + 1, lane], v_in[pack, t + 2, lane])
                 v += vec3(u_in[pack, t, lane], u_in[pack, t + 1, lane], u_in[pack, t + 2, lane])
                 for axis in range(3):
                     h = slot_row(weight_in, lever_in, axes_in, pack, lane, contact, slot, axis)
                     slip[axis] += wp.dot(h, v)
-                    if axis == 0:
-                        before += wp.dot(h, v0)
+                    if axis == 0 and restitution > real(0.0):
+                        before += wp.dot(
+                            h, vec3(v0_in[pack, t, lane], v0_in[pack, t + 1, lane], v0_in[pack, t + 2, lane])
+                        )
         distance = distance_in[pack, contact, lane]
         target = distance
         is_late = contact >= listed_in[pack, 0, lane]
         if target < real(0.0) and softness_in[pack, contact, lane] == real(0.0) and not is_late:
             target = wp.max(share * target, -recovery * x_scale)
         normal = target + x_scale * slip[0]
-        restitution = restitution_in[pack, contact, lane]
         if restitution > real(0.0) and before < -bounce_speed and distance + x_scale * before <= real(0.0):
             normal = x_scale * (restitution * before + slip[0])
         elif is_measured:

@@ -264,13 +264,13 @@ class Detector:
         Args:
             x: Node positions at the end of the step [m].
             pose: Poses of frames there.
-            v: Node velocities, without effect.
-            twist: Velocities of frames, without effect.
+            v: Node velocities, those of ``find``.
+            twist: Velocities of frames, likewise.
             depth: Least penetration that counts [m].
             pairs: Contact laws.
             again: Listed contacts that still penetrate have been measured at an end of this step before.
         """
-        a, c, motion = self.arrays, self.contacts, self._motion(x, pose, v, twist)
+        a, c, motion = self.arrays, self.contacts, self._motion(x, pose, v, twist, again=True)
         laws = [pairs.distance.real, pairs.alarm.real, 0.0, 0.0]
         self._near(motion, laws, self.near)
         self._launch(self.k_looks.quiet, self.couple_count, [c.idle.real], [self.near.real, self.reach.real])
@@ -295,19 +295,19 @@ class Detector:
         Args:
             end: Node positions and poses of frames at the end of the step.
             start: Those at its start.
-            at: Node velocities and twists, without effect.
+            at: Node velocities and twists, those of ``find``.
             pairs: Contact laws.
         """
         c = self.contacts
         if self.is_patient:
             waiting = (self.none, self.reserve_count, self.reserve_key, self.reserve_couple, self.reserve_face)
-            self._measure(self.places(*end, *at), waiting, self.reserve_touch, is_found=False)
+            self._measure(self.places(*end, *at, again=True), waiting, self.reserve_touch, is_found=False)
             inputs = [self.scene.couple, self.capacity, self.reserve_key.real, self.reserve_couple.real]
-            inputs += [self.reserve_face.real, self.reserve_touch.real, pairs.distance.real]
+            inputs += [self.reserve_face.real, self.reserve_touch.real, pairs.distance.real, c.idle.real]
             outputs = [self.reserve_count.real, c.first.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
             outputs += [self.couple.real, self.face.real, self.known.real]
             self._launch(self.k_list.call_up, None, inputs, outputs)
-            self._describe(self.places(*start, *at), pairs, is_found=False)
+            self._describe(self.places(*start, *at, again=True), pairs, is_found=False)
             self.called.copy_from(c.first)
         else:
             self.called.copy_from(c.count)
@@ -347,11 +347,11 @@ class Detector:
         if a.surface_chunks.size:
             self._launch(self.k_surface.measure, parts, [*inputs, face.real], outputs)
 
-    def _motion(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
+    def _motion(self, x: Rows, pose: Rows, v: Rows, twist: Rows, *, again: bool = False) -> Any:
         """Bounds of soft bodies and rods, boxes of their trees; positions and velocities as a struct."""
         a = self.arrays
         inputs: list[Any]
-        motion = self.places(x, pose, v, twist)
+        motion = self.places(x, pose, v, twist, again=again)
         if self.embedded_count:
             x, v = self.all_x, self.all_v
         if self.has_points:
@@ -366,10 +366,13 @@ class Detector:
             self._launch_elements(self.k_tree.refit, count, inputs, [self.tree_box.S])
         return motion
 
-    def places(self, x: Rows, pose: Rows, v: Rows, twist: Rows) -> Any:
-        """Positions and velocities as a struct, those of embedded points among them."""
+    def places(self, x: Rows, pose: Rows, v: Rows, twist: Rows, *, again: bool = False) -> Any:
+        """Positions and velocities as a struct, those of embedded points among them.
+
+        ``again`` takes velocities of nodes and embedded points as they were in the step's first search.
+        """
         if self.embedded_count:
-            x, v = self._with_embedded(x, self.all_x), self._with_embedded(v, self.all_v)
+            x, v = self._with_embedded(x, self.all_x), self.all_v if again else self._with_embedded(v, self.all_v)
         motion = self.types.Motion()
         motion.x, motion.pose, motion.v, motion.twist = x.real, pose.real, v.real, twist.real
         motion.tree_box, motion.choice = self.tree_box.real, self.choice.real
@@ -418,10 +421,11 @@ class Detector:
         self._launch(self.k_shape.find, a.shape_chunks.size, inputs, [*outputs, *found])
         if self.k_sift is not None and a.tracked_chunks.size:
             inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
-            inputs += [self.moved.real, self.chunk_hits.real, self.sought.real, self.room.real]
+            inputs += [self.moved.real, laws[0], ahead < 0.0, self.chunk_hits.real, self.sought.real, self.room.real]
             wp.launch(self.k_sift.sift, dim=(self.packs, a.tracked_chunks.size), inputs=inputs, device=self.device)
-        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real, self.sought.real, self.k_sift is not None]
-        self._launch(self.k_surface.find, a.surface_chunks.size, inputs, [*outputs, self.room.real])
+        inputs = [self.scene, a.surface_chunks, *shared, self.moved.real, self.k_sift is not None]
+        outputs = [self.sought.real, *outputs, self.room.real]
+        self._launch(self.k_surface.find, a.surface_chunks.size, inputs, outputs)
 
     # Memory
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -73,3 +74,12 @@ def test_looks_are_chosen_by_the_scene() -> None:
     builder.add_contact(ball, builder.add_rigid(sw.Plane(), kinematic=True))
     options = sw.Simulation(builder.finalize(1), dt=0.01).options
     assert (options.contact_passes, options.further_passes) == (1, 0)
+    builder = sw.ModelBuilder()
+    corners, stuff = np.vstack((np.zeros((1, 3)), 0.01 * np.eye(3))), sw.Corotational(1e5, 0.3)
+    one, other = (
+        builder.add_tets(corners + shift, [[0, 1, 2, 3]], material=stuff, density=1e3) for shift in (0.0, 0.02)
+    )
+    builder.add_contact(one, other)
+    options = sw.Simulation(builder.finalize(1), dt=0.01).options
+    assert (options.contact_passes, options.further_passes) == (1, 1)
+    assert options.skin == pytest.approx(0.25 * 0.01 * 2.0 ** (1.0 / 6.0))  # of a regular element as large as these

@@ -325,6 +325,9 @@ BAD = [
     ({"hand_start": 0.3}, "hand_start must lie within hand_z"),
     ({"pull_cone": 4.0}, "pull_cone must"),
     ({"mu": (0.9, 0.2)}, "mu must be"),
+    ({"mu": (0.0, 0.0)}, r"mu must begin at 0.0062 or higher, got \(0.0, 0.0\): nothing but friction lifts an object"),
+    ({"mu": (0.05, 0.8), "object_mass": (0.1, 1.0)}, "press 1 kg by no more than 80 N each; make mu or youngs larger"),
+    ({"mu": (0.0, 0.5), "gravity": (0.0, 0.0, 0.0)}, "mu must begin at 0.0001 or higher"),
     ({"hand_z": (0.15, 0.26)}, "hand_z must begin at 0.0995 m or lower, so that fingers come down"),
     ({"hand_yaw": (0.5, 1.0)}, "hand_yaw must hold 0, where the hand starts"),
     ({"max_displacement": 0.005}, "max_displacement must be 0.0097 m or more, or the fingers do not close"),
@@ -342,7 +345,8 @@ BAD = [
 
 
 def test_options_at_the_edge_are_taken():
-    """What still works is not refused: weightless, tilted within friction, a narrow range of the hand."""
+    """What still works is not refused: weightless, tilted within friction, little of it, a narrow range of the hand."""
+    GripperConfig(mu=(0.0062, 0.0062))
     for options in ({"gravity": (0.0, 0.0, 0.0)}, {"gravity": (7.8, 0.0, -9.81)}, {"hand_z": (0.0995, 0.26)}):
         GripperConfig(**options)
     GripperConfig(hand_yaw=(0.0, 0.0), max_displacement=0.012, action_kind="discrete")

@@ -140,6 +140,17 @@ def flat_and_block(**options):
     return Probe(scene, x, alarm=0.0004, slack=0.002, **options), len(under)
 
 
+def ended(probe, first, depth):
+    """Contacts of a step that moves the block down, as its looks see them."""
+    end = probe.x.copy()
+    end[:, first:, 2] -= depth
+    rows = [filled(EXACT, values.reshape(1, -1)) for values in (end, probe.x, probe.pose, probe.v, probe.twist)]
+    there, start, pose, *at = rows
+    probe.detector.call_up((there, pose), (start, pose), tuple(at), probe.parameters())
+    probe.detector.find_late(there, pose, *at, 4e-5, probe.parameters(), again=False)
+    return probe.contacts()
+
+
 def test_what_waits_joins_from_the_side_where_it_was():
     """Between alarm and slack nothing is listed; a step that leads through the sheet brings all of it in.
 
@@ -152,25 +163,27 @@ def test_what_waits_joins_from_the_side_where_it_was():
     told = eager.find(0.01)
     assert told.count >= 4
 
-    def ended(depth):
-        end = probe.x.copy()
-        end[:, first:, 2] -= depth
-        rows = [filled(EXACT, values.reshape(1, -1)) for values in (end, probe.x, probe.pose, probe.v, probe.twist)]
-        there, start, pose, *at = rows
-        probe.detector.call_up((there, pose), (start, pose), tuple(at), probe.parameters())
-        probe.detector.find_late(there, pose, *at, 4e-5, probe.parameters(), again=False)
-        return probe.contacts()
-
-    assert ended(0.0009).count == 0
+    assert ended(probe, first, 0.0009).count == 0
     for is_first_look in (False, True):  # what no look has called up waits for the next one
         if is_first_look:
             probe.find(0.01)
-        late = ended(0.0035)
+        late = ended(probe, first, 0.0035)
         np.testing.assert_array_equal(late.key, told.key)
         np.testing.assert_allclose(late.gap, told.gap, atol=1e-12)
         np.testing.assert_allclose(late.normal, told.normal, atol=1e-12)
         upwards = [-1.0, 1.0, 1.0, 1.0, 1.0]  # the sheet's corner under the block, then the block's four
         assert late.normal[:, 2] == pytest.approx(upwards, abs=0.01) and late.gap == pytest.approx(0.001)
+
+
+def test_what_waits_does_not_join_in_idle_worlds():
+    """A world that does not look again keeps its contacts, and their forces, as they are; else it joins."""
+    probe, first = flat_and_block(patient=True)
+    probe.find(0.01)
+    idle = probe.detector.contacts.idle
+    idle.fill(1)
+    assert ended(probe, first, 0.0035).count == 0
+    idle.zero()
+    assert ended(probe, first, 0.0035).count >= 4
 
 
 @pytest.mark.parametrize("seats", [True, False])
