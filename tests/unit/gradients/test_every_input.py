@@ -187,7 +187,8 @@ def given_of(sim: sw.Simulation) -> tuple[Inputs, dict[str, dict[str, Any]]]:
     sizes: dict[str, dict[str, Any]] = {group: {} for group in given}
     for name, (size, change) in STATE.items():
         value = getattr(sim, name)
-        is_bound = name == "cavity_pressure" and not bool((sim.params.cavity_max_pressure_rate < 1e20).any())  # to its command
+        rate = sim.params.cavity_max_pressure_rate
+        is_bound = name == "cavity_pressure" and not bool((rate < 1e20).any())  # to its command
         if value.numel() and not is_bound and not (name.startswith("body") and sim.model.has_kinematic):
             if name == "rod_q":
                 start = turned(value, near(0.0 * sim.rod_w, size))
