@@ -17,7 +17,8 @@ from softwarp.identification import Differentiable
 
 Floats = NDArray[np.float64]
 
-TOLERANCE = 1.0e-6  # of a pose: extents of the scene that are left to go, or relative imbalance
+TOLERANCE = 1.0e-7  # of a pose: extents of the scene that are left to go, or relative imbalance
+NEAR = 1.0e-3  # the same of poses that others start from
 
 
 class Displacements:
@@ -57,7 +58,7 @@ class Displacements:
         self.single.write(values)
         climb = Equilibrium(self.single.sim, warm=True)
         for world, pressure in enumerate(self.pressure):
-            pose = climb({"cavity_pressure": pressure}, tolerance=TOLERANCE)
+            pose = climb({"cavity_pressure": pressure}, tolerance=NEAR)
             for name in ("node_x", "cable_tension", "cavity_pressure"):
                 getattr(sim, name)[world] = getattr(pose, name)[0]
         self.is_started = True

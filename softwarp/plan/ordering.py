@@ -6,7 +6,9 @@ list of 3x3 block operations: no search, no pivoting, no branch on data. Theory:
 
 from __future__ import annotations
 
+import hashlib
 from typing import TYPE_CHECKING
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,9 @@ DIRECTIONS = 24  # in half a turn, that cuts of a large model are tried across
 SHARES = (0.5, 0.47, 0.53, 0.44, 0.56, 0.41, 0.59, 0.38, 0.62, 0.35, 0.65)  # of the blocks on the first side
 FINALISTS = 10  # cuts with the fewest blocks along them, whose separators are found
 
+# Structures that models hold, by what they follow from: the same scene with other worlds or precision shares its own.
+_analyzed: WeakValueDictionary[bytes, Symbolic] = WeakValueDictionary()
+
 
 def analyze(edges: IntArray, count: int, points: FloatArray | None = None, contacts: int = 0) -> Symbolic:
     """Order and factorise the pattern of a symmetric block matrix symbolically.
@@ -46,13 +51,22 @@ def analyze(edges: IntArray, count: int, points: FloatArray | None = None, conta
         George (1973), nested dissection; Liu (1990), the role of elimination trees in sparse factorization.
     """
     edges = _unique_edges(edges)
+    places = None if points is None else np.asarray(points, dtype=np.float64)
+    digest = hashlib.sha256(repr((count, contacts, edges.shape, points is None)).encode() + edges.tobytes())
+    digest.update(b"" if places is None else places.tobytes())
+    found = _analyzed.get(digest.digest())
+    if found is None:
+        found = _analyzed[digest.digest()] = _analyze(edges, count, places, contacts)
+    return found
+
+
+def _analyze(edges: IntArray, count: int, points: FloatArray | None, contacts: int) -> Symbolic:
+    """As ``analyze``, of edges without duplicates."""
     candidates = [_minimum_degree(edges, count)]
     leaves = (LARGE_LEAF,) if count >= LARGE else LEAF_SIZES if contacts else LEAF_SIZES[:1]
     for leaf in leaves:
         if points is not None and count > leaf:
-            candidates.append(
-                _nested_dissection(edges, np.asarray(points, dtype=np.float64), leaf, is_large=count >= LARGE)
-            )
+            candidates.append(_nested_dissection(edges, points, leaf, is_large=count >= LARGE))
     best: tuple[float, IntArray, list[IntArray]] | None = None
     for order in candidates:
         structure = _factor_pattern(edges, order)

@@ -47,7 +47,7 @@ class StaticNewton:
         self.sides.copy_from(self.system.linear.y)
 
     def linearise(self) -> None:
-        """Factor and Z where the worlds are; needs ``measure``."""
+        """Factor and Z, in ``y``, where the worlds are; needs ``measure``, and ``keep_sides`` after it."""
         system, adjoint = self.system, self.adjoint
         system.tangent()
         system.exact_tangent(adjoint.a_upper)
@@ -55,7 +55,6 @@ class StaticNewton:
         system.linear.y.zero()
         system.rows.into_sides()
         adjoint.lu.solve(1 + self.count)
-        self.keep_sides()
 
     def measure(self) -> None:
         """Imbalance b at the trial positions, forces of rows included."""

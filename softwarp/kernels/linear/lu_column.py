@@ -1,6 +1,6 @@
 """Block LU of one world at a time on a CPU, without lists of pairs. Theory: docs/theory/statics.md.
 
-Arguments but for the structure, results and order of sums are those of ``factor_world`` of ``lu``. A list has an entry
+Arguments but for the structure, results and order of sums are those of the kernels of ``lu``. A list has an entry
 for every product of blocks and leads all over the factors, which is slow when they exceed the cache. Here column j is
 gathered in a scratch array from the columns k with a block (j, k), whose blocks (i, k), i >= j, follow it in memory.
 """
@@ -14,6 +14,7 @@ from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.linear import lu
 
 COLUMN_ROWS = 24  # scratch of a block row: the rows of L_ij, then those of U_ji', each filled up to four numbers
+TOGETHER = 8  # right-hand sides of a pass through the factors, which are larger than the cache
 
 _LOAD = """
 const REAL* l = &wp::index(a, w, 0);
@@ -61,6 +62,56 @@ for (int p = begin; p < end; ++p) {
 }
 """
 
+_SOLVE = """
+typedef REAL sides_t __attribute__((vector_size(TOGETHER * sizeof(REAL))));
+const REAL* l = &wp::index(lower, w, 0);
+const REAL* u = &wp::index(upper, w, 0);
+REAL* y = &wp::index(y_out, w, 3 * size * first);
+REAL* z = &wp::index(column_out, w, 0);
+sides_t v[3], s;
+for (int i = 0; i < 3 * size; ++i) {
+    for (int side = 0; side < TOGETHER; ++side) {
+        z[TOGETHER * i + side] = side < sides ? y[3 * size * side + i] : 0;
+    }
+}
+for (int j = 0; j < size; ++j) {
+    __builtin_memcpy(v, z + 3 * TOGETHER * j, sizeof(v));
+    for (int b = col_start.data[j]; b < col_start.data[j + 1]; ++b) {
+        REAL* below = z + 3 * TOGETHER * l_row.data[b];
+        for (int r = 0; r < 3; ++r) {
+            __builtin_memcpy(&s, below + TOGETHER * r, sizeof(s));
+            for (int c = 0; c < 3; ++c) {
+                s -= l[9 * b + 3 * r + c] * v[c];
+            }
+            __builtin_memcpy(below + TOGETHER * r, &s, sizeof(s));
+        }
+    }
+}
+for (int j = size - 1; j >= 0; --j) {
+    __builtin_memcpy(v, z + 3 * TOGETHER * j, sizeof(v));
+    for (int b = col_start.data[j]; b < col_start.data[j + 1]; ++b) {
+        const REAL* below = z + 3 * TOGETHER * l_row.data[b];
+        for (int r = 0; r < 3; ++r) {
+            __builtin_memcpy(&s, below + TOGETHER * r, sizeof(s));
+            for (int c = 0; c < 3; ++c) {
+                v[c] -= u[9 * b + 3 * r + c] * s;
+            }
+        }
+    }
+    for (int r = 0; r < 3; ++r) {
+        const REAL* inverse = l + 9 * j + 3 * r;
+        s = inverse[0] * v[0] + inverse[1] * v[1] + inverse[2] * v[2];
+        __builtin_memcpy(z + TOGETHER * (3 * j + r), &s, sizeof(s));
+    }
+}
+for (int i = 0; i < 3 * size; ++i) {
+    for (int side = 0; side < sides; ++side) {
+        y[3 * size * side + i] = z[TOGETHER * i + side];
+    }
+}
+"""
+assert 3 * TOGETHER <= COLUMN_ROWS
+
 
 @cache
 def kernels(precision: str) -> SimpleNamespace:
@@ -71,7 +122,8 @@ def kernels(precision: str) -> SimpleNamespace:
     invert_diagonal = lu.kernels(scalar).invert_diagonal
 
     def native(code: str) -> str:
-        return code.replace("REAL", "double" if S is wp.float64 else "float").replace("COLUMN_ROWS", str(COLUMN_ROWS))
+        code = code.replace("REAL", "double" if S is wp.float64 else "float")
+        return code.replace("COLUMN_ROWS", str(COLUMN_ROWS)).replace("TOGETHER", str(TOGETHER))
 
     @wp.func_native(native(_LOAD))
     def load_block(
@@ -110,6 +162,7 @@ def kernels(precision: str) -> SimpleNamespace:
         row_start: wp.array(dtype=wp.int32),
         row_block: wp.array(dtype=wp.int32),
         # Workspace in
+        is_kept_in: wp.array(dtype=wp.int32),
         a_in: wp.array2d(dtype=S),
         a_upper_in: wp.array2d(dtype=S),
         # Workspace out
@@ -118,8 +171,10 @@ def kernels(precision: str) -> SimpleNamespace:
         upper_out: wp.array2d(dtype=S),
         pivot_out: wp.array2d(dtype=S),
     ):
-        """Factorise one world column by column."""
+        """Factorise one world column by column, if its factor is not to be kept."""
         w = wp.tid()
+        if is_kept_in[w] != 0:
+            return
         for j in range(size):
             load_block(column_out, a_in, a_upper_in, w, j, l_source[j])
             for block in range(col_start[j], col_start[j + 1]):
@@ -155,4 +210,40 @@ def kernels(precision: str) -> SimpleNamespace:
                         lower_out[w, t + 3 * r + c] = value
                         upper_out[w, t + 3 * r + c] = column_out[w, s + 12 + 4 * r + c]
 
-    return SimpleNamespace(factor_world=factor_world)
+    @wp.func_native(native(_SOLVE))
+    def solve_together(
+        column_out: wp.array2d(dtype=S),
+        y_out: wp.array2d(dtype=S),
+        lower: wp.array2d(dtype=S),
+        upper: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        sides: int,
+        size: int,
+        l_row: wp.array(dtype=wp.int32),
+        col_start: wp.array(dtype=wp.int32),
+    ):
+        """``y <- A^-1 y`` for some right-hand sides from the first one on, column by column."""
+
+    @wp.kernel(module=module, enable_backward=False)
+    def solve_world(
+        # Symbolic
+        size: int,
+        l_row: wp.array(dtype=wp.int32),
+        col_start: wp.array(dtype=wp.int32),
+        # Workspace in
+        lower_in: wp.array2d(dtype=S),
+        upper_in: wp.array2d(dtype=S),
+        sides: int,
+        # Workspace out
+        column_out: wp.array2d(dtype=S),
+        y_out: wp.array2d(dtype=S),
+    ):
+        """Solve for all right-hand sides of one world in place."""
+        w = wp.tid()
+        for group in range((sides + wp.static(TOGETHER - 1)) // wp.static(TOGETHER)):
+            first = wp.static(TOGETHER) * group
+            count = wp.min(sides - first, wp.static(TOGETHER))
+            solve_together(column_out, y_out, lower_in, upper_in, w, first, count, size, l_row, col_start)
+
+    return SimpleNamespace(factor_world=factor_world, solve_world=solve_world)

@@ -19,6 +19,7 @@ PROXIMAL = 1.0e-4  # proximal term of the tangential block, relative to its trac
 STALL = 20  # sweeps after which a world is asked what they brought
 STALLED = 0.9  # of the least correction before them, above which they brought nothing
 NEAR = 10.0  # tolerances within which a world that has stalled rests
+ROUNDS = 5  # times in a row that a world may have stalled, until sweeps go on without guesses between them
 
 
 @cache
@@ -276,7 +277,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``).
 
         A world rests once a sweep corrects no gap by more than the tolerance [m], or where some sweeps have not brought
-        a correction near it down; the others of its pack go on.
+        a correction near it down; the others of its pack go on. Where guesses between sweeps lead round and round far
+        from rest, plain sweeps take over.
         """
         w = wp.tid()
         count = pack_count_in[w, 0]
@@ -291,6 +293,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         last = S(real(0.0))
         mark = S(real(1.0e30))
         lowest = S(real(1.0e30))
+        rounds = S(real(0.0))
+        guesses = S(real(1.0))
         for sweep in range(sweeps):
             if is_any(active):
                 for i in range(total):
@@ -339,7 +343,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     is_far = above(worst, tolerance * real(wp.static(NEAR)))
                     active = mul(active, wp.max(S(real(1.0)) - is_stalled, is_far))
                     mark = lowest
-                if sweep + 1 < sweeps and is_any(active):
+                    rounds = mul(rounds + is_stalled, is_stalled)
+                    guesses = mul(guesses, S(real(1.0)) - above(rounds, real(wp.static(ROUNDS - 0.5))))
+                if sweep + 1 < sweeps and is_any(mul(active, guesses)):
                     led = lead(
                         delassus_in,
                         gap_in,
@@ -362,9 +368,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         count,
                         sweep + 2 >= sweeps,
                         extent,
-                        active,
+                        mul(active, guesses),
                     )
-                    own = mul(active, S(real(1.0)) - led)
+                    own = mul(mul(active, guesses), S(real(1.0)) - led)
                     if is_any(own):
                         best = accelerate(
                             delassus_in,

@@ -20,6 +20,9 @@ class LUSolver:
 
     Args:
         linear: Provides the structure, the memory of L and the right-hand sides ``y``.
+
+    Attributes:
+        is_kept: Worlds whose factor ``factor`` leaves as it is, where worlds are taken one at a time; else None.
     """
 
     def __init__(self, linear: LinearSolver) -> None:
@@ -32,9 +35,11 @@ class LUSolver:
         self.upper: Rows = allocate(variant, worlds, blocks, device)
         self.pivot: Rows = allocate(variant, worlds, linear.symbolic.size, device)
         self.column: Rows | None = None
+        self.is_kept: wp.array | None = None
         if variant.name == "scalar":
             self.column_kernels = lu_column.kernels("float64" if variant.real is wp.float64 else "float32")
             self.column = allocate(variant, worlds, lu_column.COLUMN_ROWS * linear.symbolic.size, device)
+            self.is_kept = wp.zeros(linear.width, dtype=wp.int32, device=device)
         else:
             linear.send_pairs()
 
@@ -44,7 +49,7 @@ class LUSolver:
         i, symbolic = linear.index, linear.symbolic
         if self.column is not None:
             names = ("l_row", "l_col", "l_source", "col_start", "row_start", "row_block")
-            inputs = [symbolic.size, *(i[name] for name in names), a.S, a_upper.S]
+            inputs = [symbolic.size, *(i[name] for name in names), self.is_kept, a.S, a_upper.S]
             outputs = [self.column.S, self.lower.S, self.upper.S, self.pivot.S]
             self._launch(self.column_kernels.factor_world, linear.width, inputs, outputs)
             return
@@ -65,6 +70,10 @@ class LUSolver:
         """``y <- A^-1 y`` for the first ``sides`` right-hand sides."""
         linear, k, y = self.linear, self.kernels, self.y
         i, n = linear.index, linear.symbolic.size
+        if self.column is not None:
+            inputs = [n, i["l_row"], i["col_start"], self.lower.S, self.upper.S, sides]
+            self._launch(self.column_kernels.solve_world, linear.width, inputs, [self.column.S, y.S])
+            return
         rows = [i["row_start"], i["row_block"]]
         if not linear.variant.world_fastest:
             inputs = [n, i["l_row"], i["l_col"], i["col_start"], *rows, self.lower.S, self.upper.S]

@@ -60,26 +60,22 @@ def pay_alone(symbolic: Symbolic) -> bool:
 def runs(symbolic: Symbolic) -> Runs:
     """Strips of a world by itself, and the runs of each source."""
     strips = schedule(symbolic, MOST)
-    ends = np.append(strips.source[:, 4], strips.place.size)[1:]
-    listed, places = [], []
-    found: list[IntArray] = [np.zeros((0, 3), dtype=np.int32)]
-    length = count = 0
-    for (first, columns, top, own, begin), end in zip(strips.source.tolist(), ends.tolist(), strict=True):
-        listed.append((first, columns, top, own, length, count))
-        places.append(strips.place[begin : begin + own])
-        length += own
-        others = strips.place[begin + own : end]
-        cuts = np.flatnonzero(np.diff(others, prepend=-2) != 1)
-        sizes = np.diff(cuts, append=others.size)
-        found.append(np.stack([own + cuts, others[cuts], sizes], axis=1))
-        count += cuts.size
-    listed.append((0, 0, 0, 0, length, count))
+    own = strips.source[:, 3]
+    size = np.diff(np.append(strips.source[:, 4], strips.place.size))
+    is_own = np.arange(strips.place.size) - np.repeat(strips.source[:, 4], size) < np.repeat(own, size)
+    others, first = strips.place[~is_own], np.append(0, np.cumsum(size - own))
+    is_cut = np.diff(others, prepend=-2) != 1
+    is_cut[first[:-1][size > own]] = True  # runs end with their source
+    cuts = np.flatnonzero(is_cut)
+    source = np.repeat(np.arange(own.size), size - own)[cuts]
+    inside = own[source] + cuts - first[source]
+    begin = np.column_stack([np.append(0, np.cumsum(own)), np.searchsorted(cuts, first)])
     return Runs(
         run_strip_start=strips.strip_start,
         run_strip_source=strips.strip_source,
-        run_source=np.array(listed, dtype=np.int32),
-        run_place=np.concatenate([np.zeros(0, dtype=np.int32), *places]).astype(np.int32),
-        run=np.concatenate(found).astype(np.int32),
+        run_source=np.hstack([np.pad(strips.source[:, :4], ((0, 1), (0, 0))), begin]).astype(np.int32),
+        run_place=strips.place[is_own],
+        run=np.stack([inside, others[cuts], np.diff(cuts, append=others.size)], axis=1).astype(np.int32),
     )
 
 

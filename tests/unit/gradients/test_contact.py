@@ -12,7 +12,7 @@ from softwarp.gradients import Equilibrium, Rollout, States
 from tests.gradient_cases import SIDE, STEPS, Inputs, gradients
 from tests.unit.gradients.test_adjoint import check
 
-EXACT = {"gauss_seidel_tolerance": 1e-15, "gauss_seidel_iterations": 3000}
+EXACT = {"gauss_seidel_tolerance": 1e-15, "gauss_seidel_iterations": 30000}
 OPEN, STUCK, SLIPPING = range(3)
 
 

@@ -150,6 +150,41 @@ def _membrane(builder: sw.ModelBuilder) -> None:
     builder.add_membrane(_box(builder), skin, thickness=1e-3, youngs=1e6, name="skin")
 
 
+def _tubes(builder: sw.ModelBuilder) -> None:
+    tubes = [sw.Tube([sw.TubeSection(0.2)], radius=0.4e-3, youngs=5e10)]
+    builder.add_telescope([*tubes, sw.Tube([sw.TubeSection(0.1)], radius=1e-3, inner_radius=6e-4, youngs=5e10)])
+
+
+def _touching_rod(builder: sw.ModelBuilder) -> None:
+    stem = builder.add_rod([[0, 0, 0], [0.1, 0, 0]], radius=0.01, youngs=1e6, density=1e3)
+    builder.add_contact(stem, builder.add_rigid(sw.Plane(), kinematic=True))
+
+
+def _two_boxes(builder: sw.ModelBuilder) -> None:
+    one, other = (builder.add_rigid(sw.Box((0.1, 0.1, 0.1)), mass=1.0, pose=(0, 0, z)) for z in (0.05, 0.16))
+    builder.add_contact(one, other)
+
+
+def _carried_quadratic(builder: sw.ModelBuilder) -> None:
+    mesh = meshing.elevate(meshing.box((0.1, 0.1, 0.1), (1, 1, 1)))
+    body = builder.add_tets(mesh, material=material("large", 1e5, 0.4), density=1e3)
+    builder.attach(body, box=((-1, -1, -1), (1e-6, 1, 1)), to=builder.add_rigid(sw.Sphere(0.1), mass=1.0))
+
+
+def _stretched(builder: sw.ModelBuilder) -> None:
+    builder.add_cable(_box(builder), [(0.01, 0.02, 0.03), (0.09, 0.02, 0.05)], stiffness=100.0)
+
+
+def _inflated(builder: sw.ModelBuilder) -> None:
+    skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
+    builder.add_cavity(_box(builder), skin.nodes + 0.03, skin.surface(), control="volume")
+
+
+def _inflated_beside_a_rod(builder: sw.ModelBuilder) -> None:
+    _inflated(builder)
+    builder.add_rod([[1, 0, 0], [1.1, 0, 0]], radius=0.01, youngs=1e6, density=1e3)
+
+
 REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] = [
     (_box, {"integrator": "trapezoidal"}, "take integrator='bdf2' or 'euler'"),
     (_contact_plane, {"integrator": "bdf2"}, "contact has no gradient with integrator 'bdf2'"),
@@ -157,6 +192,13 @@ REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] =
     (lambda builder: _box(builder, relaxation=(0.4, 0.02)), {}, "the relaxation of body 'body0'"),
     (_membrane, {}, "membrane 'skin'"),
     (_pieces, {}, "a rod that contact cuts into pieces has no gradient yet; leave contact_pieces out"),
+    (_tubes, {}, "tubes that slide in each other"),
+    (_touching_rod, {}, "as that of rods; take a shape, a mesh or a soft body"),
+    (_two_boxes, {}, "as that of two rigid bodies, of which only balls have one"),
+    (_carried_quadratic, {}, "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet"),
+    (_stretched, {"integrator": "bdf2"}, "a cable that stretches has no gradient with integrator 'bdf2'"),
+    (_inflated, {"integrator": "bdf2"}, "volume control of chamber 'cavity0' has no gradient with integrator 'bdf2'"),
+    (_inflated_beside_a_rod, {"pressure_tangent": True}, "the tangent of pressures has no gradient beside rods"),
     (_still, {}, "a scene where nothing moves freely has nothing to differentiate"),
     (_contact, {"contact_passes": 2}, "more than once a step (contact_passes=2, refinement=1) has no gradient yet"),
 ]

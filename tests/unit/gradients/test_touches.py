@@ -182,6 +182,12 @@ def test_a_rigid_body_on_a_soft_bed(kind: str) -> None:
     assert modes(sim, given) & {STUCK, SLIPPING}
 
 
+def test_a_box_that_is_wedged() -> None:
+    """Forces of two near edges, between which guesses between sweeps went round and round for ever."""
+    sim = on_bed("box")
+    check(Rollout(sim), thrown(sim, 0.0, 0.0, (46,)), loss, SIZES)
+
+
 @pytest.mark.parametrize(("lift", "along", "down"), [(-5e-4, 0.6, 0.1), (1e-3, 0.0, 0.2)])
 def test_soft_on_soft(lift: float, along: float, down: float) -> None:
     """Contacts of nodes with faces and of edges with edges, whose weights depend on where both are."""

@@ -1,0 +1,257 @@
+"""Scenes that have all parts at once, by every input that a rollout takes, against central differences in float64.
+
+Other files of this folder prove parts by themselves, in every law and state of theirs; here are the inputs of a part
+beside other parts. Every number of the state, every command and every parameter that a scene has is in the list of what
+is compared, so that a new one is, too.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.gradients import Rollout, States
+from softwarp.model.gradients import COMMANDS, PARAMETERS
+from softwarp.scene import SoftBody
+from tests.cases import FITTED
+from tests.gradient_cases import STEPS, Inputs
+from tests.unit.gradients.test_contact import EXACT, SLIPPING, STUCK
+from tests.unit.gradients.test_rods import check, displaced, turned
+from tests.unit.gradients.test_touches import modes
+
+STATE = {  # how far a start is from rest, and the change for differences
+    "node_x": (2e-4, 1e-8),
+    "node_v": (0.05, 1e-6),
+    "rod_x": (1e-4, 1e-8),
+    "rod_q": (0.02, 1e-6),
+    "rod_v": (0.05, 1e-5),
+    "rod_w": (1.0, 1e-3),
+    "body_pose": (1e-4, 3e-8),
+    "body_twist": (0.3, 1e-6),
+    "cavity_pressure": (20.0, 1e-2),
+}
+CONTROLS = {  # commands at random of this size, and the change
+    "node_force": (0.02, 1e-5),
+    "rod_force": (1e-3, 1e-6),
+    "body_force": (1e-3, 1e-6),
+    "body_velocity": (0.1, 1e-6),
+    "joint_target": (0.05, 1e-6),
+    "joint_force": (0.01, 1e-6),
+    "traction": (20.0, 1e-2),
+    "cable_displacement": (4e-3, 1e-8),
+    "cable_tension": (0.5, 1e-5),
+    "cavity_pressure": (300.0, 1e-2),
+    "cavity_volume": (0.0, 1e-11),
+    "cavity_gas": (0.0, 1e-11),
+}
+CHANGES = {  # of parameters; of others relative to them
+    "gravity": 1e-4,
+    "nu": 1e-5,
+    "pair_mu": 1e-5,
+    "rayleigh_mass": 1e-2,
+    "rayleigh_stiffness": 1e-6,
+    "rod_nu": 1e-4,
+    "rod_rayleigh_mass": 1e-2,
+    "rod_rayleigh_stiffness": 1e-6,
+    "body_damping": 1e-2,
+    "cable_stiffness": 1e-3,
+    "cable_damping": 1e-3,
+}
+RELATIVE = 1e-4
+RESULTS = {  # weights in the loss
+    "node_x": 10.0,
+    "node_v": 1.0,
+    "rod_x": 10.0,
+    "rod_q": 1.0,
+    "rod_v": 1.0,
+    "rod_w": 0.02,
+    "body_pose": 10.0,
+    "body_twist": 0.3,
+    "marker_x": 10.0,
+    "cable_tension": 0.1,
+    "cavity_pressure": 1e-3,
+}
+RAYLEIGH = (0.5, 0.01)
+
+
+def beam(
+    builder: sw.ModelBuilder, at: tuple[float, float, float], chamber: str = "pressure", *, hits: bool = False
+) -> SoftBody:
+    """A soft beam along x with a law of own parameters, a chamber, a loaded top and a cable that stretches.
+
+    Args:
+        builder: Of the scene.
+        at: Its corner.
+        chamber: Control of the chamber.
+        hits: Leave the traction out.
+    """
+    size = (0.1, 0.04, 0.04)
+    mesh = meshing.box(size, (3, 1, 1))
+    body = builder.add_tets(
+        mesh.nodes + at, mesh.tets, material=FITTED["yeoh"](1e5, 0.4), density=1000.0, rayleigh=RAYLEIGH
+    )
+    skin = meshing.box((0.03, 0.02, 0.02), (1, 1, 1))
+    rate = {"max_pressure_rate": 1e4} if chamber == "pressure" else {}
+    builder.add_cavity(body, skin.nodes + (0.03, 0.01, 0.01) + np.array(at), skin.surface(), control=chamber, **rate)  # type: ignore[arg-type]
+    path = np.array([(0.01, 0.03, 0.03), (0.05, 0.03, 0.035), (0.09, 0.03, 0.03)]) + at
+    builder.add_cable(body, path, stiffness=300.0, damping=2.0)
+    if not hits:
+        low = np.array(at) + (0.0, 0.0, 0.0399)
+        builder.add_traction(body, (0.0, 0.0, 1.0), box=(low - (1.0, 1.0, 0.0), low + 1.0))
+    return body
+
+
+def rod(builder: sw.ModelBuilder, end: tuple[float, float, float]) -> Any:
+    """A clamped rod that ends at a point, along x, with a cable."""
+    line = np.linspace(np.array(end) - (0.2, 0.0, 0.0), end, 4)
+    found = builder.add_rod(line, radius=0.01, youngs=5e7, nu=0.4, density=1100.0, rayleigh=(0.2, 0.005))
+    builder.fix(found, nodes=[0])
+    builder.add_cable(found, line[[1, 2, 3]] + (0.0, 0.006, 0.004), control="force")
+    return found
+
+
+def carried(base: str = "rod", chamber: str = "pressure") -> sw.Simulation:
+    """A beam on the end of a rod, or on a moved base beside one, with a box at its own end."""
+    builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
+    body, stem = beam(builder, (0.0, 0.0, 0.0), chamber), rod(builder, (0.0, 0.02, 0.02))
+    box = builder.add_rigid(sw.Box((0.02, 0.06, 0.05)), mass=0.03, pose=(0.11, 0.02, 0.02), damping=0.4)
+    builder.attach(body, box=((0.0999, -1, -1), (1, 1, 1)), to=box)
+    if base == "rod":
+        builder.attach(body, box=((-1, -1, -1), (1e-6, 1, 1)), to=stem, node=3)
+    else:
+        held = builder.add_rigid(sw.Box((0.02, 0.04, 0.04)), pose=(-0.01, 0.02, 0.02), kinematic=True)
+        builder.attach(body, box=((-1, -1, -1), (1e-6, 1, 1)), to=held)
+    builder.add_cable([body, box], [(0.03, 0.01, 0.035), (0.12, 0.01, 0.04)], pull_point=(-0.1, 0.0, 0.1))
+    builder.add_marker(box, (0.12, 0.02, 0.02))
+    return finished(builder)
+
+
+def jointed(base: str = "rod") -> sw.Simulation:
+    """Two links on a servo and a slider, from the end of a rod or a moved base, with a beam at their end."""
+    builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
+    stem = rod(builder, (0.0, 0.0, 0.0))
+    shape = sw.Box((0.1, 0.03, 0.02))
+    upper = builder.add_rigid(shape, mass=0.08, pose=(0.05, 0.0, 0.0), damping=0.2)
+    lower = builder.add_rigid(shape, mass=0.06, pose=(0.15, 0.0, 0.0))
+    held: Any = (stem, 3)
+    if base == "kinematic":
+        held = builder.add_rigid(sw.Box((0.02, 0.02, 0.02)), pose=(-0.01, 0.0, 0.0), kinematic=True)
+    servo: dict[str, Any] = {"control": "position", "stiffness": 0.5, "damping": 0.01}
+    builder.add_joint(held, upper, "hinge", anchor=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.2), **servo)
+    builder.add_joint(upper, lower, "slider", anchor=(0.1, 0.0, 0.0), axis=(1.0, 0.1, 0.0), control="force")
+    body = beam(builder, (0.2, -0.02, -0.02))
+    builder.attach(body, box=((0.19, -1, -1), (0.2 + 1e-6, 1, 1)), to=lower)
+    builder.add_cable([upper, lower], [(0.03, 0.01, 0.01), (0.17, 0.01, 0.01)], stiffness=200.0, damping=1.0)
+    builder.add_marker(lower, (0.2, 0.0, 0.01))
+    return finished(builder)
+
+
+def touching(base: str = "free", passes: int = 1) -> sw.Simulation:
+    """A beam on a tilted box that moves freely or is moved, beside a rod; with joints beside it without a look."""
+    builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
+    body = beam(builder, (0.0, 0.0, 0.0), hits=True)
+    rod(builder, (-0.3, 0.0, 0.0))
+    turn = np.array((0.05, 0.02, 0.03, 1.0))
+    pose = (0.047, 0.023, -0.0225, *(turn / np.linalg.norm(turn)))
+    how: dict[str, Any] = {"kinematic": True}
+    if base == "free":
+        how = {"mass": 0.5, "inertia": (1e-3, 2e-3, 1.5e-3), "damping": 0.3}
+    other = builder.add_rigid(sw.Box((0.3, 0.3, 0.05)), pose=pose, **how)
+    builder.add_contact(body, other, mu=0.5)
+    if passes == 0:
+        link = builder.add_rigid(sw.Box((0.1, 0.03, 0.02)), mass=0.05, pose=(0.5, 0.0, 0.0))
+        servo: dict[str, Any] = {"control": "position", "stiffness": 0.5, "damping": 0.01}
+        builder.add_joint(None, link, "hinge", anchor=(0.45, 0.0, 0.0), axis=(0.0, 1.0, 0.2), **servo)
+    sim = finished(builder, contact_passes=passes, **EXACT)
+    sim.node_v[...] = torch.tensor((0.2, 0.06, -0.8))  # thrown on it
+    return sim
+
+
+def finished(builder: sw.ModelBuilder, **options: Any) -> sw.Simulation:
+    """Its simulation."""
+    return sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01, **options)
+
+
+def given_of(sim: sw.Simulation) -> tuple[Inputs, dict[str, dict[str, Any]]]:
+    """Every input that a scene has, away from rest, and its change."""
+    rng = np.random.default_rng(2)
+
+    def near(value: torch.Tensor, size: float) -> torch.Tensor:
+        return value + size * torch.tensor(rng.standard_normal(value.shape)).to(value)
+
+    given: Inputs = {"state": {}, "controls": {}, "parameters": {}}
+    sizes: dict[str, dict[str, Any]] = {group: {} for group in given}
+    for name, (size, change) in STATE.items():
+        value = getattr(sim, name)
+        rate = sim.params.cavity_max_pressure_rate
+        is_bound = name == "cavity_pressure" and not bool((rate < 1e20).any())  # to its command
+        if value.numel() and not is_bound and not (name.startswith("body") and sim.model.has_kinematic):
+            if name == "rod_q":
+                start = turned(value, near(0.0 * sim.rod_w, size))
+            elif name == "body_pose":
+                part = torch.tensor([1.0] * 3 + [50.0] * 3).to(value)
+                start = displaced(name, value, part * near(0.0 * sim.body_twist, size))
+            else:
+                start = near(value, size)
+            given["state"][name], sizes["state"][name] = start, change
+    for name, (size, change) in CONTROLS.items():
+        value = getattr(sim.control, name)
+        if value.numel() and (name != "body_velocity" or sim.model.has_kinematic):
+            steps = value.expand(STEPS, *value.shape)
+            start = near(steps, size)
+            is_mean = name in ("cable_displacement", "cable_tension", "cavity_pressure", "joint_target")
+            if is_mean:
+                start = steps + size * (1.0 + 0.2 * (start - steps) / size)
+            given["controls"][name], sizes["controls"][name] = start, change
+    for name in PARAMETERS:
+        value = getattr(sim.params, name)
+        if value.numel() and bool((value != 0.0).any()):
+            given["parameters"][name] = value.clone()
+            sizes["parameters"][name] = CHANGES.get(name, RELATIVE * value.abs())
+    return given, sizes
+
+
+def loss(states: States) -> torch.Tensor:
+    """A random weight for every result; (world,)."""
+    rng = np.random.default_rng(7)
+    total = states.node_x.new_zeros(states.node_x.shape[1])
+    for name, size in RESULTS.items():
+        value = getattr(states, name)
+        weight = torch.tensor(rng.standard_normal((STEPS, 1, *value.shape[2:]))).to(value)[-len(value) :]
+        total = total + size * (value * weight).flatten(2).sum(dim=(0, 2))
+    return total
+
+
+SCENES: dict[str, Callable[[], sw.Simulation]] = {
+    "carried by a rod": carried,
+    "carried by a base": lambda: carried("kinematic"),
+    "with a volume": lambda: carried(chamber="volume"),
+    "with gas": lambda: carried(chamber="gas"),
+    "jointed to a rod": jointed,
+    "jointed to a base": lambda: jointed("kinematic"),
+    "touching": touching,
+    "touching what is moved": lambda: touching("kinematic"),
+    "touching beside joints": lambda: touching(passes=0),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_gradients_are_those_of_differences(scene: str) -> None:
+    """By all that the scene has; what touches is pressed."""
+    sim = SCENES[scene]()
+    given, sizes = given_of(sim)
+    check(Rollout(sim), given, loss, sizes)
+    assert "touching" not in scene or modes(sim, given) & {STUCK, SLIPPING}
+
+
+def test_no_input_is_left_out() -> None:
+    """Scenes have all commands and parameters together."""
+    found: dict[str, set[str]] = {"state": set(), "controls": set(), "parameters": set()}
+    for build in SCENES.values():
+        for group, held in given_of(build())[0].items():
+            found[group] |= set(held)
+    assert found == {"state": set(STATE), "controls": set(COMMANDS), "parameters": set(PARAMETERS)}
