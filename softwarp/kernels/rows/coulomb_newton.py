@@ -211,7 +211,7 @@ for (int lane = 0; lane < LANES; ++lane) {
             for (int v = unknowns + 1; v % CHUNK; ++v) line[v] = 0;
         }
         const int end = (unknowns + CHUNK) / CHUNK;
-        for (int k = 0; k < unknowns; k += 4) {  // four rows at a time, on two rows below: each is loaded once for all others
+        for (int k = 0; k < unknowns; k += 4) {  // four rows at a time, on two below: each is loaded once
             const int block = unknowns - k < 4 ? unknowns - k : 4, skipped = k / CHUNK;
             const wide_t* const top = (const wide_t*)(system + k * WIDTH);
             const auto factors = [&](int r, int before, REAL* factor) {
