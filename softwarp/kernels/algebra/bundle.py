@@ -219,17 +219,23 @@ def scatter_corners(
 
 
 @wp.func_native(
-    _EACH.replace(
+    _REGISTERS
+    + "typedef int whole_t __attribute__((vector_size(sizeof(row_t))));"
+    + "__builtin_memcpy(a, m.data, sizeof(a));\nfloat* const start = &wp::index(a_out, w, 0);"
+    + TURN_ROWS
+    + _EACH.replace(
         "BODY",
         """
     const int code = wp::index(block, element, corner_pair);
     if (code < 0 || place >= index.shape[0]) continue;
-    float* b = &wp::index(a_out, w, 9 * (code >> 1));
-    if (code & 1)
-        for (int r = 0; r < 3; ++r)
-            for (int c = 0; c < 3; ++c) b[3 * r + c] += m.data[3 * c + r][lane];
-    else
-        for (int k = 0; k < 9; ++k) b[k] += m.data[k][lane];
+    float* const target = start + 9 * (code >> 1);
+    const row_t transposed = __builtin_shufflevector(b[lane], b[lane], 0, 3, 6, 1, 4, 7, 2, 5);
+    const whole_t is_transposed = whole_t{} - (code & 1);
+    row_t sum;
+    __builtin_memcpy(&sum, target, sizeof(sum));
+    sum += is_transposed ? transposed : b[lane];
+    __builtin_memcpy(target, &sum, sizeof(sum));
+    target[8] += m.data[8][lane];
 """,
     )
 )

@@ -1,11 +1,14 @@
 """Principal axes of symmetric matrices and of deformation gradients. Theory: docs/theory/hyperelastic.md.
 
-Jacobi's method turns one pair of axes after the other so that the entry g between them vanishes: where d is the
-difference of its diagonal, the smaller of two such angles has the tangent 2 g / (d +- sqrt(d^2 + 4 g^2)). Sweeps over
-the three pairs converge quadratically. F = U diag(s) V' has V from F'F, and U by orthogonalisation of F V, longest
-column first; U and V are rotations, so the smallest s has the sign of det F. There are no branches, as lanes share
-them (McAdams et al., 2011, Computing the Singular Value Decomposition of 3x3 Matrices with Minimal Branching). After
-three sweeps U diag(s) V' is F to 20 roundings in float32, the stretches alone to 3.
+The deviator B of a matrix, scaled to tr B^2 = 6, has the eigenvalues 2 cos(a + 2 pi k/3) with cos 3a = det B/2. Of the
+three, the one on the side of det B, 2 cos(acos|det B/2|/3) with that sign, lies 1.7 or more from both others, however
+near these are to each other: a polynomial tells it, and B less it has cofactors along its axis. What is left is a
+matrix of two rows in the plane across that axis; a turn by the smaller angle, the tangent of which is
+2 g/(d +- sqrt(d^2 + 4 g^2)) with the difference d of its diagonal and the entry g beside it, makes g vanish.
+
+F = U diag(s) V' has V from F'F, and U by orthogonalisation of F V, longest column first; U and V are rotations, so the
+smallest s has the sign of det F. There are no branches, as lanes share them (McAdams et al., 2011, Computing the
+Singular Value Decomposition of 3x3 Matrices with Minimal Branching). U diag(s) V' is F to 4 roundings.
 """
 
 from functools import cache
@@ -17,7 +20,17 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
 
 LEAST = {wp.float32: 1.0e-30, wp.float64: 1.0e-200}  # keeps quotients of zeros defined
-SWEEPS = {wp.float32: 3, wp.float64: 6}
+# 2 cos(acos(r)/3) for r from 0 to 1, to 2e-8, by powers of r; in float64 one step of Newton's method squares that.
+LARGEST = (
+    1.732050829614984,
+    0.33333038268348786,
+    -0.0961592956176313,
+    0.04881168115590241,
+    -0.028654594137040232,
+    0.015437627107439768,
+    -0.005923973896739198,
+    0.0011073596096139227,
+)
 
 
 @cache
@@ -26,12 +39,13 @@ def functions(variant: Variant) -> SimpleNamespace:
     S = variant.S
     real = variant.real
     mul, fma, div, sqrt, select = variant.mul, variant.fma, variant.div, variant.sqrt, variant.select
-    least, tiny, sweeps = real(LEAST[real]), real(1.0e3 * LEAST[real] ** 0.5), SWEEPS[real]
+    least, tiny, refines = real(LEAST[real]), real(1.0e3 * LEAST[real] ** 0.5), real is wp.float64
     tenth = real(0.1 * (2.0**-23 if real is wp.float32 else 2.0**-52))  # of a rounding
+    third, sixth = real(1.0 / 3.0), real(1.0 / 6.0)
     a = algebra(variant)
     Vector, Matrix, Symmetric, vector = a.Vector, a.Matrix, a.Symmetric, a.vector
     add, subtract, scaled, dot, cross = a.add, a.subtract, a.scaled, a.dot, a.cross
-    rows, matmul, transposed = a.rows, a.matmul, a.transposed
+    rows, matmul, transposed, apply = a.rows, a.matmul, a.transposed, a.apply
     row_x, row_y, row_z = a.row_x, a.row_y, a.row_z
 
     @wp.struct
@@ -52,44 +66,97 @@ def functions(variant: Variant) -> SimpleNamespace:
         v: Matrix
 
     @wp.func
-    def turned(e: Axes):
-        """Turn x and y so that xy vanishes, and give the axes the next names: y becomes x, and so on."""
+    def chosen(condition: S, a: Vector, b: Vector):
+        return vector(select(condition, a.x, b.x), select(condition, a.y, b.y), select(condition, a.z, b.z))
+
+    @wp.func
+    def largest_root(r: S):
+        """The largest x with x^3 - 3 x = 2 r, for r from 0 to 1."""
+        x = S(wp.static(real(LARGEST[-1])))
+        for k in range(wp.static(len(LARGEST) - 1)):
+            x = fma(x, r, S(wp.static(real(LARGEST[-2 - k]))))
+        if wp.static(refines):
+            square = mul(x, x)
+            x = x - div(mul(x, square - S(real(3.0))) - r - r, mul(S(real(3.0)), square - S(real(1.0))))
+        return x
+
+    @wp.func
+    def lone_axis(b: Symmetric, x: S):
+        """Unit vector along the cofactors of b - x 1, which are a multiple of its square."""
+        xx = b.xx - x
+        yy = b.yy - x
+        zz = b.zz - x
+        c = Symmetric()
+        c.xx = mul(yy, zz) - mul(b.yz, b.yz)
+        c.yy = mul(xx, zz) - mul(b.xz, b.xz)
+        c.zz = mul(xx, yy) - mul(b.xy, b.xy)
+        c.xy = mul(b.xz, b.yz) - mul(b.xy, zz)
+        c.xz = mul(b.xy, b.yz) - mul(b.xz, yy)
+        c.yz = mul(b.xy, b.xz) - mul(b.yz, xx)
+        n = chosen(c.yy - c.xx, vector(c.xy, c.yy, c.yz), vector(c.xx, c.xy, c.xz))
+        n = chosen(c.zz - wp.max(c.xx, c.yy), vector(c.xz, c.yz, c.zz), n)
+        return scaled(n, div(S(real(1.0)), sqrt(dot(n, n))))
+
+    @wp.func
+    def plane_across(n: Vector):
+        """Two unit vectors that make a right-handed frame with the unit vector n (Duff et al., 2017)."""
         one = S(real(1.0))
-        d = e.m.yy - e.m.xx
-        g = e.m.xy + e.m.xy
-        root = sqrt(fma(d, d, mul(g, g)))
-        t = div(g, d + select(d, root, -root) + select(d, S(least), S(-least)))
-        c = div(one, sqrt(fma(t, t, one)))
-        s = mul(t, c)
-        n = Axes()
-        n.m.xx = fma(t, e.m.xy, e.m.yy)
-        n.m.yy = e.m.zz
-        n.m.zz = e.m.xx - mul(t, e.m.xy)
-        n.m.xy = fma(s, e.m.xz, mul(c, e.m.yz))
-        n.m.xz = S(real(0.0))
-        n.m.yz = mul(c, e.m.xz) - mul(s, e.m.yz)
-        n.x = add(scaled(e.x, s), scaled(e.y, c))
-        n.y = e.z
-        n.z = subtract(scaled(e.x, c), scaled(e.y, s))
-        return n
+        sign = select(n.z, one, -one)
+        a = div(-one, sign + n.z)
+        b = mul(mul(n.x, n.y), a)
+        x = mul(sign, n.x)
+        return vector(fma(mul(x, n.x), a, one), mul(sign, b), -x), vector(b, fma(mul(n.y, n.y), a, sign), -n.y)
 
     @wp.func
     def principal_axes(m: Symmetric):
         """Eigenvalues on the diagonal, in no order; eigenvectors in rows, a rotation."""
         one = S(real(1.0))
-        none = S(real(0.0))
+        mean = (m.xx + m.yy + m.zz) * third
+        b = Symmetric()
+        b.xx = m.xx - mean
+        b.yy = m.yy - mean
+        b.zz = -(b.xx + b.yy)  # where rounding is all that differs, m.zz - mean leaves a trace, and no lone axis
+        beside = fma(m.xy, m.xy, fma(m.xz, m.xz, mul(m.yz, m.yz)))
+        size = fma(b.xx, b.xx, fma(b.yy, b.yy, mul(b.zz, b.zz))) * sixth + beside * third
+        size = sqrt(wp.max(size, S(least)))
+        over = div(one, size)
+        b.xx = mul(b.xx, over)
+        b.yy = mul(b.yy, over)
+        b.zz = mul(b.zz, over)
+        b.xy = mul(m.xy, over)
+        b.xz = mul(m.xz, over)
+        b.yz = mul(m.yz, over)
+        x = mul(b.yy, b.zz) - mul(b.yz, b.yz)
+        y = mul(b.xy, b.zz) - mul(b.yz, b.xz)
+        z = mul(b.xy, b.yz) - mul(b.yy, b.xz)
+        det = mul(b.xx, x) - mul(b.xy, y) + mul(b.xz, z)
+        root = largest_root(wp.min(wp.max(det, -det) * real(0.5), one))
+        root = select(det, root, -root)
+        n = lone_axis(b, root)
+        p, q = plane_across(n)
+        bp = apply(b, p)
+        bq = apply(b, q)
+        pp = dot(p, bp)
+        qq = dot(q, bq)
+        pq = dot(p, bq)
+        d = qq - pp
+        g = pq + pq
+        t = sqrt(fma(d, d, mul(g, g)))
+        t = div(g, d + select(d, t, -t) + select(d, S(least), S(-least)))
+        c = div(one, sqrt(fma(t, t, one)))
+        s = mul(t, c)
         e = Axes()
         e.m = m
-        e.x = vector(one, none, none)
-        e.y = vector(none, one, none)
-        e.z = vector(none, none, one)
-        for _ in range(3 * wp.static(sweeps)):
-            e = turned(e)
+        e.m.xx = fma(size, pp - mul(t, pq), mean)
+        e.m.yy = fma(size, fma(t, pq, qq), mean)
+        e.m.zz = fma(size, root, mean)
+        e.m.xy = S(real(0.0))
+        e.m.xz = S(real(0.0))
+        e.m.yz = S(real(0.0))
+        e.x = subtract(scaled(p, c), scaled(q, s))
+        e.y = add(scaled(p, s), scaled(q, c))
+        e.z = n
         return e
-
-    @wp.func
-    def chosen(condition: S, a: Vector, b: Vector):
-        return vector(select(condition, a.x, b.x), select(condition, a.y, b.y), select(condition, a.z, b.z))
 
     @wp.func
     def larger_first(b: Matrix, v: Matrix):

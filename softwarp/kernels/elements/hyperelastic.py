@@ -31,17 +31,19 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
 def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
     at = access.functions(variant)
     inner, entry, of_lane, member, place_of = at.inner, at.entry, at.of_lane, at.member, at.place_of
-    edges, gradients, write_corners = at.edges, at.gradients, at.write_corners
+    edges, gradients, write_corners, of_tet = at.edges, at.gradients, at.write_corners, at.of_tet
     S, T, real, world_fastest, lane_count = variant.S, inner.S, variant.real, variant.world_fastest, inner.lanes
-    module = variant.module(f"hyperelastic.{law}")
+    mul, module = inner.mul, variant.module(f"hyperelastic.{law}")
     invariants_of, parameters, is_cubic = LAWS[law].invariants, law_parameters(real, law), LAWS[law].is_cubic
-    table = wp.types.matrix((4, lane_count), real)  # of every element: a, b, c, and its volume
+    table = wp.types.matrix((3, lane_count), real)  # of every element: V a, V b, V c
+    together = LAWS[law].lanes.invariants if lane_count > 1 and LAWS[law].lanes else None
+    gather = lane_parameters(at, real, law, variant.lanes > 1) if together else None
     a = algebra(inner)
     Matrix, rows, row_x, row_y, row_z, cross, dot = a.Matrix, a.rows, a.row_x, a.row_y, a.row_z, a.cross, a.dot
     crossmul, matmul, matvec, gram, scaled, summed = a.crossmul, a.matmul, a.matvec, a.gram, a.scaled, a.summed
 
     @wp.func
-    def coefficients(
+    def coefficients_each(
         I1: T,
         I2: T,
         J: T,
@@ -67,6 +69,29 @@ def _by_invariants(variant: Variant, law: str) -> SimpleNamespace:
             found[1, lane] = b * tet_volume[tet]
             found[2, lane] = c * tet_volume[tet]
         return found
+
+    @wp.func
+    def coefficients_together(
+        I1: T,
+        I2: T,
+        J: T,
+        w: int,
+        item: int,
+        tet_index: wp.array(dtype=wp.int32),
+        tet_body: wp.array(dtype=wp.int32),
+        tet_volume: wp.array(dtype=real),
+        body_law_start: wp.array(dtype=wp.int32),
+        body_mu: wp.array3d(dtype=real),
+        body_lam: wp.array3d(dtype=real),
+        law_parameter: wp.array3d(dtype=real),
+    ):
+        """The same where the law takes all lanes at a time."""
+        p = gather(w, item, tet_index, tet_body, body_law_start, body_mu, body_lam, law_parameter)
+        volume = of_tet(tet_volume, tet_index, item)
+        found = together(I1, I2, J, p)
+        return wp.matrix_from_rows(mul(found[0], volume), mul(found[1], volume), mul(found[2], volume))
+
+    coefficients = coefficients_together if together else coefficients_each
 
     @wp.func
     def times(m: Matrix, s: T):
@@ -139,7 +164,7 @@ def _by_slopes(variant: Variant, law: str) -> SimpleNamespace:
     Vector, vector, row_x, row_y, row_z = a.Vector, a.vector, a.row_x, a.row_y, a.row_z
     crossmul, matvec, combination, product = a.crossmul, a.matvec, a.combination, a.product
     decomposition = principal.functions(inner)
-    decomposed = decomposition.stretches if together else decomposition.singular_values
+    decomposed = decomposition.stretches if together and LAWS[law].is_upright else decomposition.singular_values
 
     @wp.func
     def stress_each(

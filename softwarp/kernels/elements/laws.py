@@ -6,8 +6,8 @@ from typing import Any
 
 import warp as wp
 
+from softwarp.kernels.elements import lane_laws, ogden
 from softwarp.kernels.elements import materials as m
-from softwarp.kernels.elements import ogden
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,9 @@ class Law:
         derivatives: Warp function ``derivatives(I1, I2, J, p)``: first and second ones of a law with ``invariants``.
         slopes: Warp function ``slopes(s, p)``: psi_i of P = U diag(psi_i) V'.
         is_cubic: Whether c is not zero.
-        lanes: Module with ``slopes`` and ``principal`` of eight elements at a time; without it they take turns. Only
-            of a law that has no stress where J is not positive: its stretches are then found in less time.
+        lanes: What has ``principal``, and ``slopes`` or ``invariants``, of eight elements at a time; without it they
+            take turns.
+        is_upright: Whether it has no stress where J is not positive; lanes then find its stretches in less time.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Law:
     slopes: Any = None
     is_cubic: bool = False
     lanes: Any = None
+    is_upright: bool = False
 
     @property
     def count(self) -> int:
@@ -51,7 +53,13 @@ class Law:
 LAWS = {
     law.name: law
     for law in (
-        Law("corotational", m.corotational_energy, m.corotational_principal, slopes=m.corotational_slopes),
+        Law(
+            "corotational",
+            m.corotational_energy,
+            m.corotational_principal,
+            slopes=m.corotational_slopes,
+            lanes=lane_laws.corotational,
+        ),
         Law(
             "st_venant_kirchhoff",
             m.stvk_energy,
@@ -66,6 +74,8 @@ LAWS = {
             m.neo_hookean_principal,
             invariants=m.neo_hookean_invariants,
             derivatives=m.neo_hookean_derivatives,
+            lanes=lane_laws.neo_hookean,
+            is_upright=True,
         ),
         Law(
             "stable_neo_hookean",
@@ -81,6 +91,8 @@ LAWS = {
             own=4,
             invariants=m.yeoh_invariants,
             derivatives=m.yeoh_derivatives,
+            lanes=lane_laws.yeoh,
+            is_upright=True,
         ),
         Law(
             "mooney_rivlin",
@@ -89,9 +101,19 @@ LAWS = {
             own=3,
             invariants=m.mooney_rivlin_invariants,
             derivatives=m.mooney_rivlin_derivatives,
+            lanes=lane_laws.mooney_rivlin,
+            is_upright=True,
             is_cubic=True,
         ),
-        Law("ogden", m.ogden_energy, m.ogden_principal, own=7, slopes=m.ogden_slopes, lanes=ogden),
+        Law(
+            "ogden",
+            m.ogden_energy,
+            m.ogden_principal,
+            own=7,
+            slopes=m.ogden_slopes,
+            lanes=ogden,
+            is_upright=True,
+        ),
     )
 }
 
@@ -152,21 +174,27 @@ def law_parameters(real: Any, law: str) -> Any:
     return declared if LAWS[law].own else lame
 
 
-_ROWS = """
+_OWN_ROWS = """
 wp::mat_t<COUNT, LANES, wp::float32> p;
 for (int k = 0; k < COUNT; ++k) __builtin_memcpy(p.data[k], &wp::index(own, pack, first + k, 0), sizeof(p.data[k]));
+return p;
+"""
+_LAME_ROWS = """
+wp::mat_t<2, LANES, wp::float32> p;
+__builtin_memcpy(p.data[0], &wp::index(mu, pack, body, 0), sizeof(p.data[0]));
+__builtin_memcpy(p.data[1], &wp::index(lam, pack, body, 0), sizeof(p.data[1]));
 return p;
 """
 
 
 def lane_parameters(at: Any, real: Any, law: str, is_packed: bool) -> Any:
-    """Warp function that gathers the own parameters of the elements of an item, by lane, with the ``access`` to them.
+    """Warp function that gathers the parameters of the elements of an item, by lane, with the ``access`` to them.
 
     Where a pack of worlds is in the lanes, ``is_packed``, these are of one element, and lie side by side.
     """
     count, lanes = LAWS[law].count, at.inner.lanes
     member, place_of, parameters = at.member, at.place_of, law_parameters(real, law)
-    table = wp.types.matrix((count, lanes), real)
+    table, has_own = wp.types.matrix((count, lanes), real), bool(LAWS[law].own)
 
     @wp.func
     def gather(
@@ -187,8 +215,11 @@ def lane_parameters(at: Any, real: Any, law: str, is_packed: bool) -> Any:
                 found[k, lane] = p[k]
         return found
 
-    @wp.func_native(_ROWS.replace("COUNT", str(count)).replace("LANES", str(lanes)))
-    def rows_of(own: wp.array3d(dtype=real), pack: int, first: int) -> table: ...
+    @wp.func_native(_OWN_ROWS.replace("COUNT", str(count)).replace("LANES", str(lanes)))
+    def own_rows(own: wp.array3d(dtype=real), pack: int, first: int) -> table: ...
+
+    @wp.func_native(_LAME_ROWS.replace("LANES", str(lanes)))
+    def lame_rows(mu: wp.array3d(dtype=real), lam: wp.array3d(dtype=real), pack: int, body: int) -> table: ...
 
     @wp.func
     def gather_packed(
@@ -201,6 +232,11 @@ def lane_parameters(at: Any, real: Any, law: str, is_packed: bool) -> Any:
         lam: wp.array3d(dtype=real),
         own: wp.array3d(dtype=real),
     ):
-        return rows_of(own, w, start[tet_body[member(tet_index, item, 0)]])
+        body = tet_body[member(tet_index, item, 0)]
+        if wp.static(has_own):
+            p = own_rows(own, w, start[body])
+        else:
+            p = lame_rows(mu, lam, w, body)
+        return p
 
     return gather_packed if is_packed else gather

@@ -14,15 +14,19 @@ parameters = wp.types.matrix((1 + 2 * TERMS, LANE_COUNT), wp.float32)  # bulk, m
 three = wp.types.matrix((3, LANE_COUNT), wp.float32)
 twelve = wp.types.matrix((12, LANE_COUNT), wp.float32)
 
-# e_i = ln s_i less their mean, and the Kirchhoff stresses t_i; ``alpha`` is half of a term's exponent.
+# e_i = ln s_i less their mean, and the Kirchhoff stresses t_i; ``alpha`` is half of a term's exponent. What only large
+# strains need is left out where no lane has them.
 _STRESSES = f"""
 {POWERS}
 auto near_ratio = [](lanes_t y) -> lanes_t {{  // sinh(x)/x by y = x^2, to a rounding where that is below 1/4
-    lanes_t near = y * (1.0f / 110.0f) + 1.0f;
-    near = y * (1.0f / 72.0f) * near + 1.0f;
-    near = y * (1.0f / 42.0f) * near + 1.0f;
-    near = y * (1.0f / 20.0f) * near + 1.0f;
-    return y * (1.0f / 6.0f) * near + 1.0f;
+    const lanes_t near = y * (1.0f / 5040.0f) + 1.0f / 120.0f;
+    return (near * y + 1.0f / 6.0f) * y + 1.0f;
+}};
+auto is_any = [](whole_t holds) -> bool {{
+    unsigned long long part[sizeof(whole_t) / 8], all = 0;
+    __builtin_memcpy(part, &holds, sizeof(part));
+    for (unsigned long long one : part) all |= one;
+    return all != 0;
 }};
 const lanes_t none = {{}};
 lanes_t s[3], e[3], q[{1 + 2 * TERMS}], t[3] = {{none, none, none}};
@@ -35,15 +39,19 @@ const lanes_t middle = (e[0] + e[1] + e[2]) * (1.0f / 3.0f);
 for (int i = 0; i < 3; ++i) e[i] -= middle;
 for (int term = 0; term < {TERMS}; ++term) {{
     const lanes_t twice = q[2 * term + 1] + q[2 * term + 1], alpha = 0.5f * q[2 * term + 2];
-    bool is_used = false;
-    for (int lane = 0; lane < {LANE_COUNT}; ++lane) is_used |= twice[lane] != 0.0f;
-    if (!is_used) continue;
-    const lanes_t over_alpha = 0.5f / alpha;
-    lanes_t root[3], strain[3];  // exp(x), and (exp(2 x) - 1) e / (2 x) of x = alpha e/2
+    if (!is_any(twice != 0.0f)) continue;
+    lanes_t root[3], square[3], strain[3];  // exp(x), x^2, and (exp(2 x) - 1) e / (2 x) of x = alpha e/2
+    root[0] = exp_of(alpha * e[0]);
+    root[1] = exp_of(alpha * e[1]);
+    root[2] = 1.0f / (root[0] * root[1]);  // the three e_i add up to none
     for (int i = 0; i < 3; ++i) {{
-        const lanes_t x = alpha * e[i];
-        root[i] = exp_of(x);
-        strain[i] = x * x < 0.25f ? e[i] * root[i] * near_ratio(x * x) : (root[i] * root[i] - 1.0f) * over_alpha;
+        square[i] = alpha * alpha * e[i] * e[i];
+        strain[i] = e[i] * root[i] * near_ratio(square[i]);
+    }}
+    if (is_any((square[0] >= 0.25f) | (square[1] >= 0.25f) | (square[2] >= 0.25f))) {{
+        const lanes_t over_alpha = 0.5f / alpha;
+        for (int i = 0; i < 3; ++i)
+            strain[i] = square[i] < 0.25f ? strain[i] : (root[i] * root[i] - 1.0f) * over_alpha;
     }}
     const lanes_t mean = (strain[0] + strain[1] + strain[2]) * (1.0f / 3.0f);
     for (int i = 0; i < 3; ++i) t[i] += twice * (strain[i] - mean);
@@ -73,26 +81,36 @@ _CHANGES = """
     for (int m = 0; m < 3; ++m) {
         const int i = (m + 1) % 3, j = (m + 2) % 3;
         const lanes_t x = alpha * (e[i] - e[j]);
-        const lanes_t far = 0.5f * (root[i] * root[i] - root[j] * root[j]) / x;
-        slope[m] += twice * (x * x < 0.25f ? root[i] * root[j] * near_ratio(x * x) : far);
+        lanes_t ratio = root[i] * root[j] * near_ratio(x * x);
+        if (is_any(x * x >= 0.25f))
+            ratio = x * x < 0.25f ? ratio : 0.5f * (root[i] * root[i] - root[j] * root[j]) / x;
+        slope[m] += twice * ratio;
     }
 """
 
 # Stretch Hessian, then (psi_i - psi_j)/(s_i - s_j) and (psi_i + psi_j)/(s_i + s_j), equal stretches as all others.
 _PRINCIPAL = """
 lanes_t c[12], over[3];
+const lanes_t over_J = 1.0f / J;
 for (int m = 0; m < 3; ++m) {
     const int i = (m + 1) % 3, j = (m + 2) % 3;
-    const lanes_t d = 0.5f * (e[i] - e[j]), ratio = __builtin_elementwise_sqrt(s[i] / s[j]);
-    const lanes_t sinh = d * d < 0.25f ? near_ratio(d * d) : 0.5f * (ratio - 1.0f / ratio) / d;
+    const lanes_t d = 0.5f * (e[i] - e[j]);
+    lanes_t sinh = near_ratio(d * d);  // over d
+    if (is_any(d * d >= 0.25f)) {
+        const lanes_t ratio = __builtin_elementwise_sqrt(s[i] / s[j]);
+        sinh = d * d < 0.25f ? sinh : 0.5f * (ratio - 1.0f / ratio) / d;
+    }
     const lanes_t cosh = __builtin_elementwise_sqrt(d * d * sinh * sinh + 1.0f);
-    const lanes_t mean = 0.5f * (t[i] + t[j]);
-    over[m] = 1.0f / (s[i] * s[j]);
+    const lanes_t mean = 0.5f * (t[i] + t[j]), tanh = d * sinh / cosh;  // (s_i - s_j)/(s_i + s_j)
+    over[m] = s[m] * over_J;  // 1/(s_i s_j)
     c[6 + m] = (slope[m] * cosh / sinh - mean) * over[m];
-    c[9 + m] = (mean - 0.5f * (t[i] - t[j]) * (s[i] - s[j]) / (s[i] + s[j])) * over[m];
+    c[9 + m] = (mean - 0.5f * (t[i] - t[j]) * tanh) * over[m];
 }
 const lanes_t both = first + q[0] * J * J;  // and J^2 U''
-for (int i = 0; i < 3; ++i) c[i] = (h[i] - t[i] + both) / (s[i] * s[i]);
+for (int i = 0; i < 3; ++i) {
+    const lanes_t inverse = s[(i + 1) % 3] * s[(i + 2) % 3] * over_J;
+    c[i] = (h[i] - t[i] + both) * inverse * inverse;
+}
 c[3] = (h[3] + both) * over[2];
 c[4] = (h[4] + both) * over[1];
 c[5] = (h[5] + both) * over[0];

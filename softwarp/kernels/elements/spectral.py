@@ -139,7 +139,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     together = LAWS[law].lanes.principal if lane_count > 1 and LAWS[law].lanes else None
     gather, of_tet = lane_parameters(at, real, law, variant.lanes > 1) if together else None, at.of_tet
     decomposition = principal.functions(inner)
-    decomposed = decomposition.stretches if together else decomposition.singular_values
+    decomposed = decomposition.stretches if together and LAWS[law].is_upright else decomposition.singular_values
 
     @wp.func
     def coefficients_each(

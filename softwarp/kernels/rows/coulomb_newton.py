@@ -35,6 +35,11 @@ _CODE = """
 #pragma clang fp contract(fast)
 CONSTANTS
 typedef REAL wide_t __attribute__((vector_size(64), may_alias));
+#ifdef __AVX512F__
+typedef wide_t part_t;  // what a register holds
+#else
+typedef REAL part_t __attribute__((vector_size(32), may_alias));
+#endif
 const int CHUNK = 64 / sizeof(REAL), WIDTH = MOST + 16, STRIDE = WIDTH / CHUNK;
 const REAL ENDLESS = 1.0e30f;
 const int total = rows + 3 * count, bounds = bounded.shape[0];
@@ -206,28 +211,41 @@ for (int lane = 0; lane < LANES; ++lane) {
             for (int v = unknowns + 1; v % CHUNK; ++v) line[v] = 0;
         }
         const int end = (unknowns + CHUNK) / CHUNK;
-        for (int k = 0; k < unknowns; k += 4) {  // four rows at a time, so that a row below is loaded once for them
+        for (int k = 0; k < unknowns; k += 4) {  // four rows at a time, on two below: each is loaded once
             const int block = unknowns - k < 4 ? unknowns - k : 4, skipped = k / CHUNK;
             const wide_t* const top = (const wide_t*)(system + k * WIDTH);
-            for (int r = k; r < unknowns; ++r) {
-                REAL* const line = system + r * WIDTH;
-                const int before = r - k < block ? r - k : block;
-                REAL factor[4] = {};
+            const auto factors = [&](int r, int before, REAL* factor) {
                 for (int m = 0; m < before; ++m) {
-                    REAL entry = line[k + m];
+                    REAL entry = system[r * WIDTH + k + m];
                     for (int j = 0; j < m; ++j) entry -= factor[j] * system[(k + j) * WIDTH + k + m];
                     factor[m] = entry * x[k + m];
                 }
-                if (before == 4)
+            };
+            for (int r = k; r < k + block; ++r) {
+                REAL* const line = system + r * WIDTH;
+                REAL factor[4];
+                factors(r, r - k, factor);
+                for (int m = 0; m < r - k; ++m)
                     for (int chunk = skipped; chunk < end; ++chunk)
-                        ((wide_t*)line)[chunk] -=
-                            (top[chunk] * factor[0] + top[chunk + STRIDE] * factor[1])
-                            + (top[chunk + 2 * STRIDE] * factor[2] + top[chunk + 3 * STRIDE] * factor[3]);
-                else
-                    for (int m = 0; m < before; ++m)
-                        for (int chunk = skipped; chunk < end; ++chunk)
-                            ((wide_t*)line)[chunk] -= top[chunk + m * STRIDE] * factor[m];
-                if (before < block) x[r] = SIZE(line[r]) > least[r] ? 1 / line[r] : 0;
+                        ((wide_t*)line)[chunk] -= top[chunk + m * STRIDE] * factor[m];
+                x[r] = SIZE(line[r]) > least[r] ? 1 / line[r] : 0;
+            }
+            for (int r = k + block; r < unknowns; r += 2) {
+                const int other = r + 1 < unknowns ? r + 1 : r;
+                part_t* const one = (part_t*)(system + r * WIDTH);
+                part_t* const two = (part_t*)(system + other * WIDTH);
+                const part_t* const above = (const part_t*)top;
+                const int parts = sizeof(wide_t) / sizeof(part_t), stride = parts * STRIDE;
+                REAL a[4], b[4];
+                factors(r, 4, a);
+                factors(other, 4, b);
+                for (int part = parts * skipped; part < parts * end; ++part) {
+                    const part_t t0 = above[part], t1 = above[part + stride];
+                    const part_t t2 = above[part + 2 * stride], t3 = above[part + 3 * stride];
+                    const part_t first = one[part] - ((t0 * a[0] + t1 * a[1]) + (t2 * a[2] + t3 * a[3]));
+                    two[part] -= (t0 * b[0] + t1 * b[1]) + (t2 * b[2] + t3 * b[3]);
+                    one[part] = first;
+                }
             }
         }
         REAL sum = 0, step[WIDTH] = {};

@@ -41,6 +41,16 @@ def special():
     return np.array([*map(np.diag, diagonals), np.outer(row, column), flat, np.zeros((3, 3)), np.full((3, 3), 2.0)])
 
 
+def near_pairs(rng, count):
+    """Gradients with stretches of which two or all three are nearly equal, to parts from 1 to 1e-9, of many sizes."""
+    shape = (WORLDS, count)
+    s = np.exp(rng.uniform(-1.0, 1.0, (*shape, 3)) * 10.0 ** -rng.integers(0, 9, (*shape, 1)))
+    s[..., 1] = s[..., 0] * (1.0 + 10.0 ** -rng.uniform(0.0, 9.0, shape))
+    s = rng.permuted(s, axis=-1) * 10.0 ** rng.integers(-2, 3, (*shape, 1))
+    u, v = (np.linalg.qr(rng.standard_normal((*shape, 3, 3)))[0] for _ in range(2))
+    return u @ (s[..., None] * v)
+
+
 @every_variant
 def test_singular_values(variant, rng):
     """F = U diag(s) V', two rotations, the sign of det F in the smallest stretch: to 30 roundings, whatever F is."""
@@ -58,7 +68,7 @@ def test_singular_values(variant, rng):
 
     near = np.eye(3) + rng.standard_normal((WORLDS, 200, 3, 3)) * 10.0 ** -rng.integers(0, 9, (WORLDS, 200, 1, 1))
     cases = np.broadcast_to(special(), (WORLDS, *special().shape))
-    F = np.concatenate([near, 3.0 * rng.standard_normal((WORLDS, 200, 3, 3)), cases], axis=1)
+    F = np.concatenate([near, 3.0 * rng.standard_normal((WORLDS, 200, 3, 3)), cases, near_pairs(rng, 2000)], axis=1)
     out = applied(variant, write, 21, F).astype(float)
     U, s, V = out[..., :9].reshape(F.shape), out[..., 9:12], out[..., 12:].reshape(F.shape)
     eps = np.finfo(np.float64 if variant.real is wp.float64 else np.float32).eps
@@ -98,7 +108,13 @@ def test_principal_axes(variant, rng):
         write_vector(out, w, row + 9, e.z)
 
     root = rng.standard_normal((WORLDS, 300, 3, 3))
-    M = np.concatenate([root + root.swapaxes(2, 3), np.broadcast_to(special()[:7], (WORLDS, 7, 3, 3))], axis=1)
+    pairs = near_pairs(rng, 2000)
+    cases = [
+        root + root.swapaxes(2, 3),
+        np.broadcast_to(special()[:7], (WORLDS, 7, 3, 3)),
+        pairs.swapaxes(2, 3) @ pairs,
+    ]
+    M = np.concatenate(cases, axis=1)
     out = applied(variant, write, 12, M).astype(float)
     d, v = out[..., :3], out[..., 3:].reshape(M.shape)
     eps = np.finfo(np.float64 if variant.real is wp.float64 else np.float32).eps
