@@ -147,7 +147,7 @@ def test_other_coefficients_of_friction(mu: float, pushed: bool) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("pushed", [True, False])
 def test_a_wire_that_is_set_to_the_bend(pushed: bool) -> None:
-    """Ten times as stiff, bent without stress: its ends press no more than its middle, and it sticks to the nanometre."""
+    """Ten times as stiff, bent without stress: its ends press no more than its middle; it sticks to the nanometre."""
     stuck, ran = ways(20, pushed=pushed, straight=False)
     assert abs(stuck) < 5e-8 and ran > 2e-3
 
