@@ -198,6 +198,35 @@ def functions(real: Any) -> SimpleNamespace:
             n, d = direction(away + d * n, n)
         return d, n
 
+    @wp.func
+    def grid_distance(value: wp.array(dtype=real), start: int, nodes: wp.vec3i, origin: vec3, spacing: real, p: vec3):
+        """The distance of ``grid`` to the bit, without its gradient, which takes half of the time."""
+        cell = wp.vec3i()
+        t = vec3()
+        beside = bool(False)
+        for c in range(3):
+            last = nodes[c] - 1
+            u = (p[c] - origin[c]) / spacing
+            inside = wp.clamp(u, real(0.0), real(last))
+            cell[c] = wp.min(int(inside), last - 1)
+            t[c] = inside - real(cell[c])
+            if u != inside:
+                beside = True
+        d = real(0.0)
+        if beside:
+            d, n = grid(value, start, nodes, origin, spacing, p)
+        else:
+            base = start + (cell[0] * nodes[1] + cell[1]) * nodes[2] + cell[2]
+            for i in range(2):
+                for j in range(2):
+                    for k in range(2):
+                        f = value[base + (i * nodes[1] + j) * nodes[2] + k]
+                        wi = real(1 - i) + real(2 * i - 1) * t[0]
+                        wj = real(1 - j) + real(2 * j - 1) * t[1]
+                        wk = real(1 - k) + real(2 * k - 1) * t[2]
+                        d += f * wi * wj * wk
+        return d
+
     @wp.kernel(module=module, enable_backward=False)
     def probe(
         # Samples in
@@ -249,6 +278,7 @@ def functions(real: Any) -> SimpleNamespace:
         cylinder=cylinder,
         distance=distance,
         grid=grid,
+        grid_distance=grid_distance,
         probe=probe,
         probe_grid=probe_grid,
     )

@@ -40,7 +40,7 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
     point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
     shape = shapes.functions(real)
     to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
-    rotate_back, box_slope = shape.rotate_back, shape.box_slope
+    rotate_back, box_slope, grid_distance = shape.rotate_back, shape.box_slope, shape.grid_distance
 
     @wp.func
     def region_of(kind: int, size: vec3, p: vec3, n: vec3):
@@ -238,6 +238,22 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
         return left, right
 
     @wp.func
+    def around_lowest(scene: Scene, target: int, start: vec3, d: vec3):
+        """The ends of what lies between the neighbours of the lowest sample of a line, in the axes of a grid."""
+        first = scene.target_grid[target, 0]
+        nodes = wp.vec3i(scene.target_grid[target, 1], scene.target_grid[target, 2], scene.target_grid[target, 3])
+        origin, spacing = scene.grid_origin[target], scene.grid_spacing[target]
+        lowest = real(FAR)
+        at = int(0)
+        for k in range(wp.static(SAMPLES)):
+            t = real(k) / real(SAMPLES - 1)
+            f = grid_distance(scene.grid_value, first, nodes, origin, spacing, start + t * d)
+            if f < lowest:
+                lowest = f
+                at = int(k)
+        return real(at - 1) / real(SAMPLES - 1), real(at + 1) / real(SAMPLES - 1)
+
+    @wp.func
     def brackets_of(scene: Scene, target: int, x: vec3, q: vec4, start: vec3, d: vec3, radius: real, reach: real):
         """Where the distance along a line start + t d stops to fall and begins to rise; not at all where it does not.
 
@@ -249,15 +265,9 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
         local_start = to_local(x, q, start)
         local_d = rotate_back(q, d)
         level = real(LEVEL)
-        samples = int(0)
-        if scene.target_kind[target] == wp.static(Target.GRID):
-            samples = int(SAMPLES)
-        begin = 1 + samples  # looks: the middle, samples, both ends; then the brackets: a and b, u and v; the last one
-        end = begin + 6
+        end = int(7)  # looks: the middle, both ends; then the brackets: a and b, u and v; the last one
         low = real(0.0)
         high = real(1.0)
-        lowest = real(FAR)
-        lowest_at = int(0)
         a = Sample()  # still falls
         b = Sample()  # falls no longer
         u = Sample()  # does not rise yet
@@ -284,22 +294,16 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
                 if here.f - real(0.5) * length - radius > reach:
                     k = end
                 t = real(0.0)
-            elif k < begin:
-                if here.f < lowest:
-                    lowest = here.f
-                    lowest_at = k - 1
-                t = real(k) / real(samples - 1)
-                if k == begin - 1:
-                    low = real(lowest_at - 1) / real(samples - 1)
-                    high = real(lowest_at + 1) / real(samples - 1)
+                if k == 0 and scene.target_kind[target] == wp.static(Target.GRID):
+                    low, high = around_lowest(scene, target, local_start, local_d)
                     t = low
-                    if lowest_at == 0 or lowest_at == samples - 1:
+                    if low < real(0.0) or high > real(1.0):
                         k = end
-            elif k == begin:
+            elif k == 1:
                 a = here
                 b = here
                 t = high
-            elif k == begin + 1:
+            elif k == 2:
                 u = here
                 v = here
                 falls = a.slope < -level and v.slope >= -level
@@ -308,27 +312,27 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
                     left, right = turn_of(scene, target, local_start, local_d, length, low, high, -level)
                     t = left
                 elif rises:
-                    k = begin + 3
+                    k = 4
                 else:
                     k = end
-            elif k == begin + 2:
+            elif k == 3:
                 a = here
                 t = right
-            elif k == begin + 3:
+            elif k == 4:
                 b = here
                 if not rises:
                     k = end
-            elif k == begin + 4:
+            elif k == 5:
                 u = here
                 t = right
-            elif k == begin + 5:
+            elif k == 6:
                 v = here
                 t = level_place(a, v)
                 if not falls or a.region != v.region or v.region == wp.static(FACE):
                     k = end
             else:
                 round_place = here
-            if k == begin + 3:
+            if k == 4:
                 u = a
                 left, right = turn_of(scene, target, local_start, local_d, length, a.t, high, level)
                 t = left
@@ -455,11 +459,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("proximity")
     types = geometry.structures(real)
-    vec3 = types.vec3
-    Scene, Motion, Touch = types.Scene, types.Motion, types.Touch
+    Scene, Motion, Touch, vec3 = types.Scene, types.Motion, types.Touch, types.vec3
     place = geometry.functions(real)
-    target_x, target_q = place.target_x, place.target_q
-    frame_v = place.frame_v
+    target_x, target_q, frame_v = place.target_x, place.target_q, place.frame_v
     touch_shape = functions(real, real is wp.float32 and not variant.world_fastest).touch_shape
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
