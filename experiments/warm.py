@@ -8,14 +8,13 @@ kernels are compiled for its instruction set, a GPU's for its compute capability
 import argparse
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import warp as wp
 
-from softwarp import cli
 from softwarp.envs import registry
 from softwarp.processes import serve_parent
 from softwarp.threads import begin
@@ -23,8 +22,8 @@ from softwarp.threads import begin
 WORLDS = {"cpu": (1, 8), "cuda": (1,)}  # one world and eight lanes on a CPU; a GPU has one kind of kernels
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Compile and tell how long each environment took."""
+def main(arguments: Sequence[str], work: Callable[..., float]) -> int:
+    """Compile and tell how long each environment took; ``work`` is ``compile_for`` under a name that processes find."""
     parser = argparse.ArgumentParser(
         prog="softwarp warm", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -44,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
     start = time.perf_counter()
     spawn = get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=serve_parent) as pool:
-        running = {pool.submit(cli.compile_for, name, args.device, WORLDS[kind], folder): name for name in names}
+        running = {pool.submit(work, name, args.device, WORLDS[kind], folder): name for name in names}
         try:
             for done in as_completed(running):
                 print(f"{running[done]:<22}{done.result():6.1f} s", flush=True)

@@ -241,7 +241,7 @@ def paper(arguments: list[str]) -> int:
 
 def warm(arguments: list[str]) -> int:
     """Compile the kernels of environments ahead of time."""
-    return _code(experiment("warm").main(arguments))
+    return _code(experiment("warm").main(arguments, compile_for))
 
 
 def compile_for(*given: Any) -> float:
