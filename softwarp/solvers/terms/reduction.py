@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import mode_loads, reduction, samples
+from softwarp.kernels.elements import mode_loads, reduction, samples, tensor_sums
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.terms.floating import FloatingFrames
@@ -95,6 +95,9 @@ class ReductionTerm(Term):
 
     def _gather(self) -> None:
         """Their sum on a GPU."""
+        if tensor_sums.serves(self.shard.device, self.shard.model.precision, self.model.widest):
+            self._gather_near()
+            return
         s, m, w, k = self.shard, self.model, self.shard.work, self.k_sample
         each = m.stride // samples.TILE
         most, squares = int(each.max()), int((each * (each + 1) // 2).sum())
@@ -109,6 +112,21 @@ class ReductionTerm(Term):
                 inputs = [size, squares, more, m.body_stride, ranges, first, arrays[-1], strip.S]
                 s.each(k.whole_product, squares, inputs, [w.mode_sum.S])
             more = True
+
+    def _gather_near(self) -> None:
+        """The same on tensor cores, body after body."""
+        s, m, w = self.shard, self.model, self.shard.work
+        sum_first, tet_at, tri_at = 0, 0, 0
+        for body, modes in enumerate(m.stride.tolist()):
+            tet, tri = int(m.tet_samples[body]), int(m.tri_samples[body])
+            tets, tris = int(m.tet_samples[body + 1]) - tet, int(m.tri_samples[body + 1]) - tri
+            inputs = [tets, tet_at, samples.TET**2 * tet, tris, tri_at, samples.TRI**2 * tri, sum_first]
+            inputs += [m.tet_basis, m.tri_basis, w.sample_stiffness.S, w.thin_stiffness.S]
+            kernel, groups = tensor_sums.kernels(s.variant, modes).stiffness, -(-s.width // tensor_sums.GROUP)
+            dim, block = (groups, tensor_sums.THREADS), tensor_sums.THREADS
+            wp.launch(kernel, dim, inputs, [w.mode_sum.S], device=s.device, block_dim=block)
+            sum_first, tet_at = sum_first + modes**2, tet_at + samples.TET * modes * tets
+            tri_at += samples.TRI * modes * tris
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """Rows of b that belong to modes, from the forces of nodes."""

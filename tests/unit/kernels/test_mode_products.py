@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import mode_loads, samples
+from softwarp.kernels.elements import mode_loads, samples, tensor_sums
 
 WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
 
@@ -47,6 +47,31 @@ def test_stiffness_in_modes(size, worlds):
             block = found[:, first : first + s * s].reshape(worlds, s, s)
             np.testing.assert_allclose(block[:, *low], wanted[:, *low], rtol=1e-12, atol=1e-12)
             first += s * s
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("modes", [16, 48, 80, 96])
+def test_stiffness_on_tensor_cores(modes, device):
+    """E' K E of the second of two bodies with its tets and triangles, as exact as sums of float32; an odd world too."""
+    draws, first, count = np.random.default_rng(modes), 5, {samples.TET: 21, samples.TRI: 10}
+    wanted, arrays, stiffness = 0.0, [], []
+    for size, many in count.items():
+        E = draws.normal(size=(first + many, size, modes)).astype(np.float32)
+        K = draws.normal(size=(WORLDS, first + many, size, size)).astype(np.float32)
+        arrays.append(wp.array(E.ravel(), dtype=wp.float32, device=device))
+        stiffness.append(wp.array(K.reshape(WORLDS, -1), dtype=wp.float32, device=device))
+        own = [a.astype(np.float64) for a in (E[first:], K[:, first:])]
+        wanted = wanted + np.einsum("eai,weab,ebj->wij", own[0], own[1], own[0], optimize=True)
+    begin = [number for size, many in count.items() for number in (many, first * size * modes, first * size**2)]
+    total = wp.full((WORLDS, 7 + modes**2), 7.0, dtype=wp.float32, device=device)
+    kernel = tensor_sums.kernels(lanes.variant("cuda", "float32"), modes).stiffness
+    dim, block = (-(-WORLDS // tensor_sums.GROUP), tensor_sums.THREADS), tensor_sums.THREADS
+    wp.launch(kernel, dim, [*begin, 7, *arrays, *stiffness], [total], device=device, block_dim=block)
+    found = total.numpy()
+    low = np.tril_indices(modes)
+    error = (found[:, 7:].reshape(wanted.shape) - wanted)[:, *low]
+    assert np.sqrt((error**2).mean() / (wanted[:, *low] ** 2).mean()) < 1.0e-6
+    assert (found[:, :7] == 7.0).all()
 
 
 def test_forces_on_modes():
