@@ -8,7 +8,9 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 WIDTH = 32  # threads of a warp
-NEAR_BYTES = (22000, 49152)  # of shared memory for a world's matrix, in two sizes: ten or four worlds a multiprocessor
+# Shared memory for a world's matrix, in two sizes: ten or four worlds a multiprocessor. A block has 49152 bytes;
+# Newton's method and Warp take some of them.
+NEAR_BYTES = (22000, 48880)
 
 
 @dataclass(frozen=True)
