@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import mode_loads, reduction, samples, tensor_sums
+from softwarp.kernels.elements import mode_loads, mode_places, reduction, samples, tensor_sums
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.terms.floating import FloatingFrames
@@ -27,6 +27,7 @@ class ReductionTerm(Term):
         super().__init__(shard)
         self.model = model
         self.k, self.k_sample = reduction.kernels(shard.variant), samples.kernels(shard.variant)
+        self.k_place = mode_places.kernels(shard.variant) if shard.variant.world_fastest else None
         self.k_state = momentum.kernels(shard.variant)
         self.blocks, self.pairs = model.count // 3, int(model.pair_block.size)
         floating = model.floating
@@ -254,7 +255,10 @@ class ReductionTerm(Term):
         s, m, w = self.shard, self.model, self.shard.work
         self._widen(w.mode_q, w.wide_q)
         inputs = [*self._basis(), m.node_rest, w.wide_q.S]
-        s.each(self.k.node_positions, count, inputs, [w.x.S])
+        if self.k_place is not None:
+            s.each(self.k_place.node_positions, -(-count // mode_places.NODES), [count, *inputs], [w.x.S])
+        else:
+            s.each(self.k.node_positions, count, inputs, [w.x.S])
         if self.frames is not None:
             self.frames.place(count)
 
@@ -263,8 +267,12 @@ class ReductionTerm(Term):
         s, m, w = self.shard, self.model, self.shard.work
         self._widen(w.mode_q, w.wide_q)
         self._widen(w.mode_v, w.wide_v)
-        inputs = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S]
-        s.each(self.k.node_states, int(m.node.size), inputs, [w.x.S, w.reduced_v.S])
+        inputs, count = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S], int(m.node.size)
+        if self.k_place is not None:
+            items = -(-count // mode_places.NODES)
+            s.each(self.k_place.node_states, items, [count, *inputs], [w.x.S, w.reduced_v.S])
+        else:
+            s.each(self.k.node_states, count, inputs, [w.x.S, w.reduced_v.S])
         if self.frames is not None:
             self.frames.place(int(m.node.size))
             self.frames.velocities()

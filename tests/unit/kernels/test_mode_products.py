@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import mode_loads, samples, tensor_sums
+from softwarp.kernels.elements import mode_loads, mode_places, samples, tensor_sums
 
 WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
 
@@ -95,3 +95,31 @@ def test_forces_on_modes():
     for number, s in enumerate(STRIDES):
         wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_places_of_nodes_of_two_bodies(precision):
+    """X + Phi q and Phi v of nodes that threads take four at a time, some of both bodies; the rest is left alone."""
+    draws, real = np.random.default_rng(2), wp.float64 if precision == "float64" else wp.float32
+    listed, body = np.array([7, 0, 3, 9, 4, 1, 8, 2, 6, 5]), np.array([0, 0, 0, 1, 1, 1, 1, 1, 1, 0])
+    stride = np.array(STRIDES)[body]
+    start = np.cumsum(3 * stride) - 3 * stride
+    basis, wide = [draws.normal(size=(3, s)) for s in stride], np.array([0, STRIDES[0]])
+    rest, q = draws.normal(size=(len(body), 3)), draws.normal(size=(2, WORLDS, sum(STRIDES)))
+    inputs = [wp.array(a, dtype=wp.int32, device="cpu") for a in (listed, body, start, wide, STRIDES)]
+    flat = np.concatenate([b.ravel() for b in basis])
+    inputs += [wp.array(a, dtype=real, device="cpu") for a in (flat, rest, *q)]
+    k = mode_places.kernels(lanes.variant("cuda", precision))
+    for count in (10, 9, 5):
+        dim = (-(-count // mode_places.NODES), WORLDS)
+        x, y, v = (wp.full((WORLDS, 30), 5.0, dtype=real, device="cpu") for _ in range(3))
+        wp.launch(k.node_positions, dim, [count, *inputs[:-1]], [x], device="cpu")
+        wp.launch(k.node_states, dim, [count, *inputs], [y, v], device="cpu")
+        assert np.array_equal(x.numpy(), y.numpy())
+        for values, amplitudes, origin in ((y, q[0], rest), (v, q[1], 0.0 * rest)):
+            wanted = np.full((WORLDS, 10, 3), 5.0)
+            for i in range(count):
+                own = amplitudes[:, wide[body[i]] : wide[body[i]] + stride[i]]
+                wanted[:, listed[i]] = own @ basis[i].T + origin[i]
+            fine = 1.0e-12 if precision == "float64" else 1.0e-5
+            np.testing.assert_allclose(values.numpy(), wanted.reshape(WORLDS, 30), rtol=fine, atol=fine)
