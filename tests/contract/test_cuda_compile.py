@@ -18,7 +18,6 @@ import warp as wp
 
 from softwarp.kernels.algebra import lanes
 from softwarp.kernels.elements import laws
-from softwarp.kernels.rows import coulomb_tiers, coulomb_warp
 
 # Values of the parameters that kernel factories have besides the variant.
 CHOICES: dict[str, tuple[Any, ...]] = {
@@ -120,16 +119,6 @@ def test_factory_compiles(factory, precision, choice, tmp_path):
         assert any(isinstance(value, wp.Function) for value in vars(made).values())
         return
     compile_to_ptx(kernels, tmp_path)
-
-
-@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
-def test_memory_of_a_block_holds_a_world_with_many_contacts(precision, tmp_path):
-    """The kernel that keeps the largest matrix there has room for whatever else it keeps."""
-    variant = lanes.variant("cuda", precision)
-    tier = max(coulomb_tiers.tiers(variant, 5, 96), key=lambda tier: tier.near_rows)
-    kernel = coulomb_warp.kernels(variant, 1, tier.own_contacts, tier.near_rows).gauss_seidel
-    kernel.module.options["block_dim"] = coulomb_tiers.WIDTH
-    assert shared_bytes(compile_to_ptx([kernel], tmp_path)) > SHARED
 
 
 def test_plain_kernels_compile(tmp_path):

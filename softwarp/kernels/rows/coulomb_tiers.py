@@ -8,9 +8,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 WIDTH = 32  # threads of a warp
-# Shared memory for a world's matrix, in two sizes: ten or four worlds a multiprocessor. A block has 49152 bytes;
-# Newton's method and Warp take some of them.
-NEAR_BYTES = (22000, 48880)
+NEAR_BYTES = (22000, 49152)  # of shared memory for a world's matrix, in two sizes: ten or four worlds a multiprocessor
 
 
 @dataclass(frozen=True)

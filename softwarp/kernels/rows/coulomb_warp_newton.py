@@ -17,103 +17,50 @@ from softwarp.kernels.rows.coulomb_tiers import WIDTH
 from softwarp.kernels.rows.warp_share import first_thread, meet, places, told_number
 
 MOST = 95  # rows of a system up to which it is solved: all worlds wait for the one that takes longest
-ROOM = 64  # unknowns and a right side that a warp's registers hold
 TRIES = 10  # ways that are gone before a world goes on with the acceleration
 
 NONE, FIXED, LOW, HIGH, FREE, OPEN, BARE, STICK, SLIDE = range(9)  # no law that holds; those of rows, then of contacts
 GOES, RESTS, LOST, LARGE = range(4)  # what came of it: a way, nothing to solve, no solution, too many rows
 ENDLESS = 1.0e30
 
-# A line of the system: one entry per unknown, the right side, and behind the last one 1 / pivot. Threads own columns;
-# the solution ends in the column of the right side. Where a world has a block to itself, a system of few unknowns lies
-# in registers, from the line that is next to be eliminated on; its column goes round through shared memory. Else lines
-# are read and written some at a time, so that loads need not wait for each other.
+# A line of the system: one entry per unknown, the right side, and behind the last one 1 / pivot. Four lines at a time,
+# so that loads need not wait for each other. Threads own columns; the solution ends in the column of the right side.
 _SOLVE = """
 #if defined(__CUDA_ARCH__)
 #define MEET __syncwarp();
 #define TELL(value, source) __shfl_sync(0xffffffffu, value, source)
-#define NEAR __shared__ __align__(16)
 #else
 static SCALAR slot;
 #define MEET WP_TILE_SYNC();
 #define TELL(value, source) ({ if (thread == source) slot = value; MEET const SCALAR told = slot; MEET told; })
-#define NEAR static
 #endif
 const int COLUMNS = MOST / 32 + 1;
 SCALAR* const a = &wp::index(system, w, 0);
 const int parts = unknowns / 32 + 1;
-if (ROOM > 0 && unknowns < ROOM) {
-    NEAR SCALAR column[ROOM + 1];
-    SCALAR own[2][ROOM + 1], least[2];
-    UNROLL
-    for (int m = 0; m < 2; ++m) {
+SCALAR top[COLUMNS];
+for (int k = 0; k < unknowns; ++k) {
+    SCALAR* const pivots = a + k * stride;
+    const SCALAR pivot = pivots[k], least = pivots[unknowns + 1];
+    const SCALAR inverse = (pivot < 0 ? -pivot : pivot) > least ? (SCALAR)1 / pivot : (SCALAR)0;
+    for (int m = 0; m < COLUMNS; ++m) {
         const int c = thread + 32 * m;
-        least[m] = c < unknowns ? a[c * stride + unknowns + 1] : (SCALAR)0;
-        UNROLL
-        for (int r = 0; r < ROOM; ++r) own[m][r] = r < unknowns && c <= unknowns ? a[r * stride + c] : (SCALAR)0;
+        top[m] = m < parts && c > k && c <= unknowns ? pivots[c] * inverse : (SCALAR)0;
     }
-    for (int k = 0; k < unknowns; ++k) {
-        const int left = unknowns - k;
-        if (thread == k % 32) {
-            UNROLL
-            for (int b = 0; b < ROOM; b += 8) {
-                if (b >= left) continue;
-                UNROLL
-                for (int r = b; r < b + 8; ++r) column[r] = k < 32 ? own[0][r] : own[1][r];
-            }
-        }
-        const SCALAR limit = TELL((k < 32 ? least[0] : least[1]), k % 32);
-        MEET
-        const SCALAR pivot = column[0];
-        const SCALAR inverse = (pivot < 0 ? -pivot : pivot) > limit ? (SCALAR)1 / pivot : (SCALAR)0;
-        SCALAR top[2];
-        UNROLL
-        for (int m = 0; m < 2; ++m) {
-            const int c = thread + 32 * m;
-            const bool is_right = c > k && c <= unknowns;
-            top[m] = is_right ? own[m][0] * inverse : (SCALAR)0;
-            if (is_right) a[k * stride + c] = own[m][0];
-        }
-        if (thread == 0) a[k * stride + unknowns + 1] = inverse;
-        UNROLL
-        for (int b = 0; b < ROOM; b += 8) {
-            if (b >= left) continue;
-            UNROLL
-            for (int r = b; r < b + 8; ++r) {
-                const SCALAR factor = r + 1 < ROOM ? column[r + 1] : (SCALAR)0;
-                UNROLL
-                for (int m = 0; m < 2; ++m) own[m][r] = (r + 1 < ROOM ? own[m][r + 1] : (SCALAR)0) - factor * top[m];
-            }
-        }
-        MEET
-    }
-} else {
-    const int LINES = 16;
-    SCALAR top[COLUMNS];
-    for (int k = 0; k < unknowns; ++k) {
-        SCALAR* const pivots = a + k * stride;
-        const SCALAR pivot = pivots[k], least = pivots[unknowns + 1];
-        const SCALAR inverse = (pivot < 0 ? -pivot : pivot) > least ? (SCALAR)1 / pivot : (SCALAR)0;
+    for (int r = k + 1; r < unknowns; r += 4) {
+        SCALAR* const line = a + r * stride;
+        const int last = unknowns - r < 4 ? unknowns - r : 4;
+        SCALAR factor[4];
+        for (int i = 0; i < 4; ++i) factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
         for (int m = 0; m < COLUMNS; ++m) {
             const int c = thread + 32 * m;
-            top[m] = m < parts && c > k && c <= unknowns ? pivots[c] * inverse : (SCALAR)0;
+            if (m >= parts || c <= k || c > unknowns) continue;
+            SCALAR entry[4];
+            for (int i = 0; i < 4; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
+            for (int i = 0; i < 4; ++i) if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m];
         }
-        for (int r = k + 1; r < unknowns; r += LINES) {
-            SCALAR* const line = a + r * stride;
-            const int last = unknowns - r < LINES ? unknowns - r : LINES;
-            SCALAR factor[LINES];
-            for (int i = 0; i < LINES; ++i) factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
-            for (int m = 0; m < COLUMNS; ++m) {
-                const int c = thread + 32 * m;
-                if (m >= parts || c <= k || c > unknowns) continue;
-                SCALAR entry[LINES];
-                for (int i = 0; i < LINES; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
-                for (int i = 0; i < LINES; ++i) if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m];
-            }
-        }
-        MEET
-        if (thread == 0) pivots[unknowns + 1] = inverse;
     }
+    MEET
+    if (thread == 0) pivots[unknowns + 1] = inverse;
 }
 MEET
 SCALAR x[COLUMNS], total = 0;
@@ -121,29 +68,15 @@ for (int m = 0; m < COLUMNS; ++m) {
     const int u = thread + 32 * m;
     x[m] = u < unknowns ? a[u * stride + unknowns] : (SCALAR)0;
 }
-const int AHEAD = 8;
-for (int first = (unknowns - 1) / AHEAD * AHEAD; first >= 0; first -= AHEAD) {
-    SCALAR entry[COLUMNS][AHEAD], inverse[AHEAD];
-    for (int i = 0; i < AHEAD; ++i) {
-        const int k = first + i;
-        inverse[i] = k < unknowns ? a[k * stride + unknowns + 1] : (SCALAR)0;
-        for (int m = 0; m < COLUMNS; ++m) {
-            const int u = thread + 32 * m;
-            entry[m][i] = u < k && k < unknowns ? a[u * stride + k] : (SCALAR)0;
-        }
-    }
-    for (int i = AHEAD - 1; i >= 0; --i) {
-        const int k = first + i;
-        if (k >= unknowns) continue;
-        SCALAR own = 0;
-        for (int m = 0; m < COLUMNS; ++m) own = m == k / 32 ? x[m] : own;
-        const SCALAR solved = TELL(own, k % 32) * inverse[i];
-        total += solved;
-        for (int m = 0; m < COLUMNS; ++m) {
-            const int u = thread + 32 * m;
-            if (u < k) x[m] -= entry[m][i] * solved;
-            else if (u == k) x[m] = solved;
-        }
+for (int k = unknowns - 1; k >= 0; --k) {
+    SCALAR own = 0;
+    for (int m = 0; m < COLUMNS; ++m) own = m == k / 32 ? x[m] : own;
+    const SCALAR solved = TELL(own, k % 32) * a[k * stride + unknowns + 1];
+    total += solved;
+    for (int m = 0; m < COLUMNS; ++m) {
+        const int u = thread + 32 * m;
+        if (u < k) x[m] -= a[u * stride + k] * solved;
+        else if (u == k) x[m] = solved;
     }
 }
 for (int m = 0; m < COLUMNS; ++m) {
@@ -153,7 +86,6 @@ for (int m = 0; m < COLUMNS; ++m) {
 MEET
 #undef MEET
 #undef TELL
-#undef NEAR
 return total;
 """
 
@@ -181,10 +113,7 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
     first_contact = max(own_rows, 1)
     Numbers = Laws
 
-    room = ROOM if near_rows and real is wp.float32 else 0
-    source = _SOLVE.replace("SCALAR", name_of(real)).replace("MOST", str(MOST)).replace("ROOM", str(room))
-
-    @wp.func_native(source.replace("UNROLL", "#pragma unroll"))
+    @wp.func_native(_SOLVE.replace("SCALAR", name_of(real)).replace("MOST", str(MOST)))
     def solve(system: wp.array2d(dtype=real), w: int, thread: int, unknowns: int, stride: int) -> real:
         """Solve the system; the sum of the solution, which is endless where one of its numbers is."""
 
