@@ -23,7 +23,7 @@ GROUP = 2  # worlds of a block
 THREADS = 128  # of a block
 WIDEST = 96  # modes of a body, whose sums the registers of two warps hold
 OLDEST = 80  # compute capability from which tensor cores take numbers of float32's range
-BLOCKS = 3  # at once on a multiprocessor, which bounds the registers of a thread
+BLOCKS = 2  # at once on a multiprocessor, which bounds the registers of a thread
 
 # Samples of one kind, SIZE rows of E each. Columns in shared memory are swapped by sample, so that the threads of a
 # warp find them in different banks.
