@@ -139,10 +139,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         x_out: wp.array2d(dtype=S),
     ):
-        """X + Phi q of one listed node."""
+        """X + Phi q of one listed node, for a CPU."""
         w, i = wp.tid()
-        if wp.static(world_fastest):
-            i, w = wp.tid()
         place(node, node_body, node_basis, body_wide, body_stride, basis, node_rest, wide_q_in, w, i, x_out)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -219,10 +217,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         x_out: wp.array2d(dtype=S),
         v_out: wp.array2d(dtype=S),
     ):
-        """X + Phi q and Phi v of one listed node, while its row of Phi is at hand."""
+        """X + Phi q and Phi v of one listed node, while its row of Phi is at hand; for a CPU."""
         w, i = wp.tid()
-        if wp.static(world_fastest):
-            i, w = wp.tid()
         body = node_body[i]
         at = node_basis[i]
         row = 3 * node[i]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import mode_loads, reduction, samples
+from softwarp.kernels.elements import mode_loads, mode_places, reduction, samples, tensor_sums
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.terms.floating import FloatingFrames
@@ -27,6 +27,7 @@ class ReductionTerm(Term):
         super().__init__(shard)
         self.model = model
         self.k, self.k_sample = reduction.kernels(shard.variant), samples.kernels(shard.variant)
+        self.k_place = mode_places.kernels(shard.variant) if shard.variant.world_fastest else None
         self.k_state = momentum.kernels(shard.variant)
         self.blocks, self.pairs = model.count // 3, int(model.pair_block.size)
         floating = model.floating
@@ -95,6 +96,9 @@ class ReductionTerm(Term):
 
     def _gather(self) -> None:
         """Their sum on a GPU."""
+        if tensor_sums.serves(self.shard.device, self.shard.model.precision, self.model.widest):
+            self._gather_near()
+            return
         s, m, w, k = self.shard, self.model, self.shard.work, self.k_sample
         each = m.stride // samples.TILE
         most, squares = int(each.max()), int((each * (each + 1) // 2).sum())
@@ -109,6 +113,21 @@ class ReductionTerm(Term):
                 inputs = [size, squares, more, m.body_stride, ranges, first, arrays[-1], strip.S]
                 s.each(k.whole_product, squares, inputs, [w.mode_sum.S])
             more = True
+
+    def _gather_near(self) -> None:
+        """The same on tensor cores, body after body."""
+        s, m, w = self.shard, self.model, self.shard.work
+        sum_first, tet_at, tri_at = 0, 0, 0
+        for body, modes in enumerate(m.stride.tolist()):
+            tet, tri = int(m.tet_samples[body]), int(m.tri_samples[body])
+            tets, tris = int(m.tet_samples[body + 1]) - tet, int(m.tri_samples[body + 1]) - tri
+            inputs = [tets, tet_at, samples.TET**2 * tet, tris, tri_at, samples.TRI**2 * tri, sum_first]
+            inputs += [m.tet_basis, m.tri_basis, w.sample_stiffness.S, w.thin_stiffness.S]
+            kernel, groups = tensor_sums.kernels(s.variant, modes).stiffness, -(-s.width // tensor_sums.GROUP)
+            dim, block = (groups, tensor_sums.THREADS), tensor_sums.THREADS
+            wp.launch(kernel, dim, inputs, [w.mode_sum.S], device=s.device, block_dim=block)
+            sum_first, tet_at = sum_first + modes**2, tet_at + samples.TET * modes * tets
+            tri_at += samples.TRI * modes * tris
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """Rows of b that belong to modes, from the forces of nodes."""
@@ -236,7 +255,10 @@ class ReductionTerm(Term):
         s, m, w = self.shard, self.model, self.shard.work
         self._widen(w.mode_q, w.wide_q)
         inputs = [*self._basis(), m.node_rest, w.wide_q.S]
-        s.each(self.k.node_positions, count, inputs, [w.x.S])
+        if self.k_place is not None:
+            s.each(self.k_place.node_positions, -(-count // mode_places.NODES), [count, *inputs], [w.x.S])
+        else:
+            s.each(self.k.node_positions, count, inputs, [w.x.S])
         if self.frames is not None:
             self.frames.place(count)
 
@@ -245,8 +267,12 @@ class ReductionTerm(Term):
         s, m, w = self.shard, self.model, self.shard.work
         self._widen(w.mode_q, w.wide_q)
         self._widen(w.mode_v, w.wide_v)
-        inputs = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S]
-        s.each(self.k.node_states, int(m.node.size), inputs, [w.x.S, w.reduced_v.S])
+        inputs, count = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S], int(m.node.size)
+        if self.k_place is not None:
+            items = -(-count // mode_places.NODES)
+            s.each(self.k_place.node_states, items, [count, *inputs], [w.x.S, w.reduced_v.S])
+        else:
+            s.each(self.k.node_states, count, inputs, [w.x.S, w.reduced_v.S])
         if self.frames is not None:
             self.frames.place(int(m.node.size))
             self.frames.velocities()

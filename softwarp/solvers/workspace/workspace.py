@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import corotational, quadratic, samples, turning
+from softwarp.kernels.elements import corotational, quadratic, samples, tensor_sums, turning
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.frames.tube_section import LAW_ROWS, PLAN_ROWS
 from softwarp.kernels.frames.windup import SYSTEM_ROWS
@@ -250,7 +250,9 @@ def _mode_counts(model: Model) -> dict[str, int]:
         items = ("mode", "wide mode", "wide row mode", "mode pair", "mode strip", "thin mode strip")
         turning = ("floating", "floating touch", "moment", "turned point", "turning sample", "turning mode")
         return dict.fromkeys((*items, *turning, "tet sample", "tri sample", "listed", "reduced"), 0)
-    f = r.floating
+    f, strip, thin = r.floating, int(r.tet_basis.size), int(r.tri_basis.size)
+    if tensor_sums.serves(model.device, model.precision, r.widest):
+        strip = thin = 0
     return {
         "floating": model.floating_count,
         "floating touch": 0 if f is None else int(f.touch_body.size),
@@ -262,8 +264,8 @@ def _mode_counts(model: Model) -> dict[str, int]:
         "wide mode": r.wide_count,
         "wide row mode": int(r.wide_row.size),
         "mode pair": r.pair_room,
-        "mode strip": int(r.tet_basis.size) if on_gpu else 32 * (CHUNK_ROWS + 3) + r.chunk_room + r.widest**2,
-        "thin mode strip": int(r.tri_basis.size) if on_gpu else 0,
+        "mode strip": strip if on_gpu else 32 * (CHUNK_ROWS + 3) + r.chunk_room + r.widest**2,
+        "thin mode strip": thin if on_gpu else 0,
         "tet sample": int(r.tet_samples[-1]),
         "tri sample": int(r.tri_samples[-1]),
         "listed": int(r.node.size),

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import mode_loads, samples
+from softwarp.kernels.elements import mode_loads, mode_places, samples, tensor_sums
 
 WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
 
@@ -49,6 +49,31 @@ def test_stiffness_in_modes(size, worlds):
             first += s * s
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("modes", [16, 48, 80, 96])
+def test_stiffness_on_tensor_cores(modes, device):
+    """E' K E of the second of two bodies with its tets and triangles, as exact as sums of float32; an odd world too."""
+    draws, first, count = np.random.default_rng(modes), 5, {samples.TET: 21, samples.TRI: 10}
+    wanted, arrays, stiffness = 0.0, [], []
+    for size, many in count.items():
+        E = draws.normal(size=(first + many, size, modes)).astype(np.float32)
+        K = draws.normal(size=(WORLDS, first + many, size, size)).astype(np.float32)
+        arrays.append(wp.array(E.ravel(), dtype=wp.float32, device=device))
+        stiffness.append(wp.array(K.reshape(WORLDS, -1), dtype=wp.float32, device=device))
+        own = [a.astype(np.float64) for a in (E[first:], K[:, first:])]
+        wanted = wanted + np.einsum("eai,weab,ebj->wij", own[0], own[1], own[0], optimize=True)
+    begin = [number for size, many in count.items() for number in (many, first * size * modes, first * size**2)]
+    total = wp.full((WORLDS, 7 + modes**2), 7.0, dtype=wp.float32, device=device)
+    kernel = tensor_sums.kernels(lanes.variant("cuda", "float32"), modes).stiffness
+    dim, block = (-(-WORLDS // tensor_sums.GROUP), tensor_sums.THREADS), tensor_sums.THREADS
+    wp.launch(kernel, dim, [*begin, 7, *arrays, *stiffness], [total], device=device, block_dim=block)
+    found = total.numpy()
+    low = np.tril_indices(modes)
+    error = (found[:, 7:].reshape(wanted.shape) - wanted)[:, *low]
+    assert np.sqrt((error**2).mean() / (wanted[:, *low] ** 2).mean()) < 1.0e-6
+    assert (found[:, :7] == 7.0).all()
+
+
 def test_forces_on_modes():
     """Phi' f of both bodies is added, whatever nodes have no force."""
     draws, variant = np.random.default_rng(1), lanes.variant("cuda", "float64")
@@ -70,3 +95,31 @@ def test_forces_on_modes():
     for number, s in enumerate(STRIDES):
         wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_places_of_nodes_of_two_bodies(precision):
+    """X + Phi q and Phi v of nodes that threads take four at a time, some of both bodies; the rest is left alone."""
+    draws, real = np.random.default_rng(2), wp.float64 if precision == "float64" else wp.float32
+    listed, body = np.array([7, 0, 3, 9, 4, 1, 8, 2, 6, 5]), np.array([0, 0, 0, 1, 1, 1, 1, 1, 1, 0])
+    stride = np.array(STRIDES)[body]
+    start = np.cumsum(3 * stride) - 3 * stride
+    basis, wide = [draws.normal(size=(3, s)) for s in stride], np.array([0, STRIDES[0]])
+    rest, q = draws.normal(size=(len(body), 3)), draws.normal(size=(2, WORLDS, sum(STRIDES)))
+    inputs = [wp.array(a, dtype=wp.int32, device="cpu") for a in (listed, body, start, wide, STRIDES)]
+    flat = np.concatenate([b.ravel() for b in basis])
+    inputs += [wp.array(a, dtype=real, device="cpu") for a in (flat, rest, *q)]
+    k = mode_places.kernels(lanes.variant("cuda", precision))
+    for count in (10, 9, 5):
+        dim = (-(-count // mode_places.NODES), WORLDS)
+        x, y, v = (wp.full((WORLDS, 30), 5.0, dtype=real, device="cpu") for _ in range(3))
+        wp.launch(k.node_positions, dim, [count, *inputs[:-1]], [x], device="cpu")
+        wp.launch(k.node_states, dim, [count, *inputs], [y, v], device="cpu")
+        assert np.array_equal(x.numpy(), y.numpy())
+        for values, amplitudes, origin in ((y, q[0], rest), (v, q[1], 0.0 * rest)):
+            wanted = np.full((WORLDS, 10, 3), 5.0)
+            for i in range(count):
+                own = amplitudes[:, wide[body[i]] : wide[body[i]] + stride[i]]
+                wanted[:, listed[i]] = own @ basis[i].T + origin[i]
+            fine = 1.0e-12 if precision == "float64" else 1.0e-5
+            np.testing.assert_allclose(values.numpy(), wanted.reshape(WORLDS, 30), rtol=fine, atol=fine)
