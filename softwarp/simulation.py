@@ -65,7 +65,7 @@ class Simulation(
             spin by half a radian in a step need 2 or 3. Without effect on Newton iterations, which do more. None takes
             1, and more in worlds that still move: in scenes with telescopes, whose lines snap across a lumen in a step,
             up to 3, as long as a correction moves something by more than a tenth of the line's radius, or their sweeps
-            run out; on a CPU, where soft bodies meet each other, up to 2, beyond a quarter of an element's edge.
+            run out; where soft bodies meet each other up to 2, beyond a quarter of an element's edge.
         most_swing: Turn or stretch [rad] of a segment of a telescope in a step of one Newton iteration, beyond which
             its world goes only that much of its way: a linearisation holds no farther, and what crumples would cross
             its vessel. Steps below it keep their bits.

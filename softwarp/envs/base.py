@@ -47,6 +47,7 @@ from softwarp.envs.rest import bring_to_rest
 from softwarp.envs.sensors import Sensors, readable
 from softwarp.envs.snapshot import EnvSnapshot, Worlds, world_index
 from softwarp.envs.soundness import inversion_term, is_finite_state, is_inverted
+from softwarp.envs.sums import in_order
 from softwarp.model.codes import Status
 from softwarp.simulation import Simulation
 from softwarp.solvers.options import Integrator
@@ -388,7 +389,7 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
         terms = torch.where(good[:, None], terms, self._failure_terms)
         self._reward_sums.add_(terms)
         self._log_finished()
-        return terms.sum(dim=1, keepdim=True)
+        return in_order(terms.unbind(dim=1))[:, None]
 
     def _checked_distance(self) -> Tensor:
         distance = self.measure_distance()

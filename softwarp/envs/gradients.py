@@ -26,6 +26,7 @@ import warp as wp
 from tensordict import TensorDict
 from torch import Tensor
 
+from softwarp.envs.sums import length_of
 from softwarp.gradients.refusals import missing
 from softwarp.gradients.rollout import Markers
 from softwarp.gradients.worlds import DifferentiableWorlds
@@ -169,7 +170,7 @@ class _Maps:
 
     def displacement(self, points: Tensor) -> Tensor:
         """Rest length minus length [m], (world, cable)."""
-        segment = torch.linalg.vector_norm(points[:, self._end] - points[:, self._end - 1], dim=-1)
+        segment = length_of(points[:, self._end] - points[:, self._end - 1])
         least = torch.maximum(segment, self._closing)
         short = torch.where(least > 0.0, (least - segment).square() / least.clamp_min(1e-30), 0.0)
         displacement: Tensor = self._rest - (segment + 0.5 * short) @ self._owner

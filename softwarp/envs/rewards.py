@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from softwarp.envs.sums import mean_of
+
 _SMALLEST_DISTANCE = 1e-9  # m, keeps quotients finite at the goal
 
 
@@ -27,7 +29,7 @@ def cauchy(distance: Tensor, scale: float) -> Tensor:
 
 def effort(action: Tensor) -> Tensor:
     """Mean square of an action (world, k), as a cost: in [-1, 0] for actions in [-1, 1]."""
-    return -action.square().mean(dim=-1)
+    return -mean_of(action.square())
 
 
 def relative_progress(previous: Tensor, distance: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from softwarp.envs.options.base import SENSORS
+from softwarp.envs.sums import total
 from softwarp.simulation import Simulation
 from softwarp.stresses import von_mises
 
@@ -27,7 +28,7 @@ def _by_body(sim: Simulation, value: Tensor) -> Tensor:
     for body in range(sim.model.body_count):
         part = meter.slice(body)
         share = meter.volume[part]
-        mean = (value[:, part] * share).sum(dim=1) / share.sum()
+        mean = total(value[:, part] * share) / share.sum()
         columns.append(torch.stack([value[:, part].amax(dim=1), mean], dim=1))
     return torch.stack(columns, dim=1)
 
@@ -37,15 +38,15 @@ def _stress(sim: Simulation) -> Tensor:
 
 
 def _strain(sim: Simulation) -> Tensor:
-    return _by_body(sim, sim.element_strain().square().sum(dim=(2, 3)).sqrt())
+    return _by_body(sim, total(sim.element_strain().square().flatten(2)).sqrt())
 
 
 def _reaction(sim: Simulation) -> Tensor:
     found = sim.reactions()
     starts = sim.model.body_node_start.tolist()
-    parts = [found.node[:, a:b].sum(dim=1) for a, b in itertools.pairwise(starts)]
+    parts = [total(found.node[:, a:b].movedim(1, -1)) for a, b in itertools.pairwise(starts)]
     if sim.model.rod_count:
-        parts.append(found.rod[..., :3].sum(dim=1))
+        parts.append(total(found.rod[..., :3].movedim(1, -1)))
     return torch.cat([*parts, found.body.flatten(1)], dim=1)
 
 

@@ -17,8 +17,11 @@ def in_order(parts: Iterable[Tensor]) -> Tensor:
 
 
 def length_of(vector: Tensor) -> Tensor:
-    """Euclidean length along the last axis, which is short."""
-    return in_order(part.square() for part in vector.unbind(dim=-1)).sqrt()
+    """Euclidean length along the last axis, which is short; its gradient at 0 is 0."""
+    square = in_order(part.square() for part in vector.unbind(dim=-1))
+    if square.requires_grad:
+        square = square.clamp_min(torch.finfo(square.dtype).tiny)
+    return square.sqrt()
 
 
 def total(values: Tensor) -> Tensor:

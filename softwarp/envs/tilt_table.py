@@ -15,6 +15,7 @@ from torch import Tensor
 
 from softwarp.envs.options.maze import MazeSceneConfig
 from softwarp.envs.options.tripod import SERVOS
+from softwarp.envs.sums import length_of
 
 SIDE = 5  # tilts of the grid towards x and y each
 NUDGE = 0.02  # rad, of one servo for the derivative
@@ -80,7 +81,7 @@ def _measured(env: Any) -> Tensor:
             sim.step()
         x, y, z, w = sim.frame_pose[:, scene.plate, 3:].double().unbind(dim=1)
         level = torch.stack((2.0 * (x * z + y * w), 2.0 * (y * z - x * w)), dim=1)
-        length = level.norm(dim=1, keepdim=True)
+        length = length_of(level)[:, None]
         angle = torch.atan2(length, 1.0 - 2.0 * (x * x + y * y)[:, None])
         height = 100.0 * sim.marker_x[:, scene.middle, 2:].double()
         return torch.cat((angle * level / length.clamp_min(1.0e-12), height), dim=1)

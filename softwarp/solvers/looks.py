@@ -33,15 +33,13 @@ def chosen_looks(model: Model) -> dict[str, Any]:
 
     One, and up to three for lines of telescopes, which snap across a lumen within a step. Beside joints and reduced
     bodies, which are corrected in every pass, all worlds take all three. Two where soft bodies meet each other: a look
-    may give way to what the one before held back, and a wall be thinner than that; on a CPU, as on a GPU a world that
-    did not look again has had other last bits than alone.
+    may give way to what the one before held back, and a wall be thinner than that.
     """
     if model.contact is None:
         return {"contact_passes": 1}
     if model.telescopes is None or model.frames is None:
         soft = model.contact.scene.couple_table()[:, CoupleColumn.TRACKED].any()
-        on_cpu = wp.get_device(model.device).is_cpu
-        if not soft or not on_cpu or model.joints is not None or model.reduction is not None:
+        if not soft or model.joints is not None or model.reduction is not None:
             return {"contact_passes": 1}
         return {"contact_passes": 1, "further_passes": 1, "skin": SOFT_SKIN * usual_edge(model)}
     if model.joints is not None or model.reduction is not None:

@@ -55,6 +55,7 @@ from softwarp.envs.options.bubble_motion import FLOOR, RECESS_HALF, RIM_TOP, Bub
 from softwarp.envs.options.bubble_motion import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.bubble_motion import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.scenes.bubble_motion import CONTACT_CAPACITY, BubbleScene, build_bubble_scene
+from softwarp.envs.sums import length_of
 from softwarp.meshing.board_geometry import HALF
 from softwarp.render import Camera
 from softwarp.simulation import Simulation
@@ -141,7 +142,7 @@ class BubbleMotion(SoftEnv):
         goal = self._draw_goal(start)
         torch.where(mask[:, None], goal, self.goal[:, :2], out=self.goal[:, :2])
         self.goal[:, 2].masked_fill_(mask, self.config.rest_height)
-        torch.where(mask, torch.linalg.vector_norm(goal - start, dim=1), self.way, out=self.way)
+        torch.where(mask, length_of(goal - start), self.way, out=self.way)
         self.pressure.masked_fill_(mask[:, None], 0.0)
         poses = self.sim.frame_pose.clone()
         poses[:, self.scene.ball, :2] = start.to(poses.dtype)
@@ -156,7 +157,7 @@ class BubbleMotion(SoftEnv):
         # Behind them all the corner that is farthest away, which always is far enough.
         corner = self._goal_middle - self._goal_half * torch.sign(start - self._goal_middle + 1e-12)
         every = torch.cat((drawn, corner[:, None]), dim=1)
-        is_far = torch.linalg.vector_norm(every - start[:, None], dim=2) >= self.config.least_way
+        is_far = length_of(every - start[:, None]) >= self.config.least_way
         first = is_far.to(torch.int8).argmax(dim=1)
         return every.gather(1, first[:, None, None].expand(-1, 1, 2))[:, 0]
 
@@ -237,8 +238,7 @@ class BubbleMotion(SoftEnv):
         """Ball to goal in the plane [m]."""
         goal = held["goal"][:, :2]
         ball = seen.body_pose[:, self.scene.ball, :2].to(goal.dtype)
-        distance: Tensor = torch.linalg.vector_norm(ball - goal, dim=1)
-        return distance
+        return length_of(ball - goal)
 
     def reward_from(self, action: Tensor, previous: Tensor, distance: Tensor) -> dict[str, Tensor]:
         """Progress, and a bonus without a slope."""

@@ -33,6 +33,7 @@ from softwarp.envs.options.cable_reach import GOAL_SPLITS as GOAL_SPLITS
 from softwarp.envs.options.cable_reach import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.cable_reach import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.cable_reach import CableReachConfig
+from softwarp.envs.sums import length_of
 
 COMPACT_LIMIT = 10.0
 STREAM_GOAL = 0  # of random numbers; tasks have their own from 1 on
@@ -212,8 +213,7 @@ class CableReach(SoftEnv):
 
     def measure_distance(self) -> Tensor:
         """Tip to goal [m]."""
-        distance: Tensor = torch.linalg.vector_norm(self.goal - self.tip(), dim=-1)
-        return distance
+        return length_of(self.goal - self.tip())
 
     def is_success(self, distance: Tensor) -> Tensor:
         """Within the tolerance."""
@@ -270,8 +270,7 @@ class FreeReach(CableReach):
     def distance_from(self, seen: Seen, held: Mapping[str, Tensor]) -> Tensor:
         """Tip to goal [m], shape (world,)."""
         goal = held["goal"]
-        distance: Tensor = torch.linalg.vector_norm(goal - self.tip_from(seen).to(goal.dtype), dim=-1)
-        return distance
+        return length_of(goal - self.tip_from(seen).to(goal.dtype))
 
     def tip(self) -> Tensor:
         """The point that is to come to the goal [m], shape (world, 3)."""

@@ -49,6 +49,7 @@ from softwarp.envs.scenes.catch_the_object import (
     CatchScene,
     build_catch_scene,
 )
+from softwarp.envs.sums import length_of
 from softwarp.simulation import Simulation
 
 FARTHEST = 0.2879  # m, from (0, 0, 0.27) to (0.10, 0, 0): a distance worth -1
@@ -182,8 +183,7 @@ class CatchTheObject(SoftEnv):
         """Ball to goal [m]."""
         x, y, z = self._ball.unbind(dim=1)
         way = torch.stack((x - self._cart_x, y, z - self._goal_height), dim=1)
-        distance: Tensor = torch.linalg.vector_norm(way, dim=1)
-        return distance.float()
+        return length_of(way).float()
 
     def is_success(self, distance: Tensor) -> Tensor:
         """The ball lies in the cart."""

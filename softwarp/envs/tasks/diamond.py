@@ -38,6 +38,7 @@ from softwarp.envs import randomization, rewards
 from softwarp.envs.gradients import Seen
 from softwarp.envs.options.diamond import DiamondConfig
 from softwarp.envs.scenes.diamond import CABLES, DiamondScene, build_diamond_scene
+from softwarp.envs.sums import length_of
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
@@ -157,7 +158,7 @@ class Diamond(FreeReach):
             seen.marker_v[:, self.scene.effector],
             goal - self._middle,
             error,
-            error / (error.norm(dim=-1, keepdim=True) + FINE_ERROR),
+            error / (length_of(error)[:, None] + FINE_ERROR),
             held["command"],
             seen.cable_tension,
             (points[:, self._elbows] - self._rest_elbows).flatten(1),

@@ -45,6 +45,7 @@ from softwarp.envs.options.maze import MazeConfig
 from softwarp.envs.options.tripod import SERVOS
 from softwarp.envs.scenes.maze import CONTACT_CAPACITY, TripodMazeScene, build_tripod_maze_scene
 from softwarp.envs.scenes.tripod import set_up
+from softwarp.envs.sums import length_of
 from softwarp.envs.tasks.simple_maze import LIMIT, SimpleMaze, turned_to
 from softwarp.envs.tilt_table import TiltTable
 from softwarp.render import Camera
@@ -219,7 +220,7 @@ class Maze(SimpleMaze):
     def seen_tilt(self) -> Tensor:
         """How far the maze is tilted down towards x and y [rad], (world, 2): direction and length of one turn."""
         normal = self.plan_target()
-        level = normal[:, :2].norm(dim=1, keepdim=True)
+        level = length_of(normal[:, :2])[:, None]
         tilt: Tensor = torch.atan2(level, normal[:, 2:]) * normal[:, :2] / level.clamp_min(1.0e-9)
         return tilt
 

@@ -42,6 +42,7 @@ from softwarp.envs.options.simple_maze import OBSERVATION_KINDS as OBSERVATION_K
 from softwarp.envs.options.simple_maze import REWARD_KINDS as REWARD_KINDS
 from softwarp.envs.options.simple_maze import START, SimpleMazeConfig, SimpleMazeSceneConfig
 from softwarp.envs.scenes.simple_maze import CONTACT_CAPACITY, MazeScene, build_maze_scene
+from softwarp.envs.sums import length_of
 from softwarp.render import Camera
 
 PLACE, NEAR, WAY, SPEED = 0.030, 0.015, 0.2, 0.2  # m, m, m, m/s worth 1 in an observation
@@ -147,7 +148,7 @@ class SimpleMaze(SoftEnv):
         way = self.ways.remaining(maze, place, cell, side, along)
         for held in (self.way, self.least_way):
             torch.where(mask, way, held, out=held)
-        torch.where(mask, torch.linalg.vector_norm(place - goal, dim=1), self.nearest, out=self.nearest)
+        torch.where(mask, length_of(place - goal), self.nearest, out=self.nearest)
 
     def place_ball(self, place: Tensor, mask: Tensor) -> None:
         """Put the ball on the floor at places in its plane [m], (world, 2)."""
@@ -291,8 +292,7 @@ class SimpleMaze(SoftEnv):
         poses = self.sim.body_pose if poses is None else poses
         ball, maze = poses[..., self.scene.ball, :3], poses[..., self.scene.maze, :]
         place = turned_back(maze[..., 3:], ball - maze[..., :3])[..., :2].float()
-        distance: Tensor = torch.linalg.vector_norm(place - self.goal[:, :2], dim=-1)
-        return distance
+        return length_of(place - self.goal[:, :2])
 
     def measure_distance(self) -> Tensor:
         """Least distance of ball and goal within the action, in the plane of the floor [m]."""
@@ -393,7 +393,7 @@ def turned(tilt: Tensor) -> Tensor:
     Tilted down towards x by a, a plane has turned about y by a; towards y by b, about x by -b.
     """
     axis = torch.stack((-tilt[:, 1], tilt[:, 0]), dim=1)
-    half = 0.5 * torch.linalg.vector_norm(axis, dim=1, keepdim=True)
+    half = 0.5 * length_of(axis)[:, None]
     return torch.cat((0.5 * torch.sinc(half / torch.pi) * axis, torch.zeros_like(half), half.cos()), dim=1)
 
 

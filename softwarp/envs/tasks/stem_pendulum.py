@@ -30,6 +30,7 @@ from softwarp.envs.base import SoftEnv
 from softwarp.envs.options.stem_pendulum import OBSERVATION_KINDS as OBSERVATION_KINDS
 from softwarp.envs.options.stem_pendulum import StemPendulumConfig
 from softwarp.envs.scenes.stem_pendulum import PendulumScene, build_pendulum_scene, straight_poses
+from softwarp.envs.sums import length_of, mean_of
 
 SPIN, SPEED = 30.0, 3.0  # rad/s, m/s worth 1 in an observation
 LIMIT = 2.0  # of observations
@@ -120,12 +121,11 @@ class StemPendulum(SoftEnv):
 
     def measure_distance(self) -> Tensor:
         """Tip to the point a rod's length above the root [m]."""
-        distance: Tensor = torch.linalg.vector_norm(self._tip - self._top, dim=1)
-        return distance.float()
+        return length_of(self._tip - self._top).float()
 
     def is_success(self, distance: Tensor) -> Tensor:
         """High on average, for as long as success looks back."""
-        enough: Tensor = self.heights.mean(dim=1) > self.config.success_height * self.config.length
+        enough: Tensor = mean_of(self.heights) > self.config.success_height * self.config.length
         return enough
 
     def reward_terms(self, action: Tensor, distance: Tensor) -> dict[str, Tensor]:

@@ -44,6 +44,7 @@ from softwarp.envs.scenes.trunk import (
     TrunkScene,
     build_trunk_scene,
 )
+from softwarp.envs.sums import length_of, mean_of
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
@@ -150,7 +151,7 @@ class Trunk(FreeReach):
 
     def tip_from(self, seen: Seen) -> Tensor:
         """Mean of the long cables' ends [m], shape (world, 3)."""
-        return seen.marker_x.mean(dim=1)
+        return mean_of(seen.marker_x)
 
     def stations(self) -> Tensor:
         """Points along the axis, mean of the long cables' points [m], shape (world, 21, 3)."""
@@ -158,7 +159,7 @@ class Trunk(FreeReach):
 
     def _stations_from(self, seen: Seen) -> Tensor:
         points = seen.cable_x[:, self._long_points].unflatten(1, (LONG_CABLES, STATIONS))
-        mean: Tensor = points.mean(dim=1)
+        mean: Tensor = mean_of(points)
         return mean
 
     def observation_bounds(self) -> dict[str, tuple[Tensor, Tensor]]:
@@ -180,10 +181,10 @@ class Trunk(FreeReach):
         error = goal - tip
         parts = (
             tip,
-            seen.marker_v.mean(dim=1),
+            mean_of(seen.marker_v),
             goal,
             error,
-            error / (error.norm(dim=-1, keepdim=True) + FINE_ERROR),
+            error / (length_of(error)[:, None] + FINE_ERROR),
             held["command"],
             seen.cable_tension,
             stations[:, self._stations].flatten(1),

@@ -60,7 +60,7 @@ from softwarp.envs.options.trunk_cup import TrunkCupConfig
 from softwarp.envs.rest import NotAtRestError
 from softwarp.envs.scenes.trunk import LONG_CABLES, SHORT_CABLES, STATIONS
 from softwarp.envs.scenes.trunk_cup import TrunkCupScene, build_trunk_cup_scene, place_grasp, wrapped
-from softwarp.envs.sums import in_order, mean_of
+from softwarp.envs.sums import in_order, length_of, mean_of
 from softwarp.envs.tasks.cable_reach import ACTION_KINDS as ACTION_KINDS
 from softwarp.envs.tasks.cable_reach import (
     COMPACT_LIMIT,
@@ -279,7 +279,7 @@ class TrunkCup(CableReach):
         """Direction of the cup's axis from bottom to rim, a unit vector, shape (world, 3)."""
         x = self.sim.marker_x
         along = mean_of(x[:, self._rim]) - mean_of(x[:, self._bottom])
-        return torch.nn.functional.normalize(along, dim=-1).to(torch.float32)
+        return (along / length_of(along)[:, None].clamp_min(1.0e-12)).to(torch.float32)
 
     @property
     def point_markers(self) -> tuple[tuple[int, ...], ...]:
@@ -293,7 +293,7 @@ class TrunkCup(CableReach):
 
     def angle(self) -> Tensor:
         """Angle between the cup's axis and the goal's [rad], shape (world,)."""
-        half = 0.5 * torch.linalg.vector_norm(self.axis() - self.goal_axis, dim=-1)
+        half = 0.5 * length_of(self.axis() - self.goal_axis)
         return 2.0 * torch.asin(half.clamp(max=1.0))
 
     def pose_error(self) -> Tensor:
@@ -310,7 +310,7 @@ class TrunkCup(CableReach):
         """Whether the cup is far from all of the trunk, or knocked over on the table, bool (world,)."""
         if self.is_open:
             return self.tip()[:, 1] < self.config.table_height + LYING * HEIGHT
-        way = torch.linalg.vector_norm(self.stations() - self.tip()[:, None], dim=-1)
+        way = length_of(self.stations() - self.tip()[:, None])
         dropped: Tensor = way.amin(dim=1) > self.config.drop_distance
         return dropped
 
@@ -328,7 +328,7 @@ class TrunkCup(CableReach):
     def is_success(self, distance: Tensor) -> Tensor:
         """Position and axis within their tolerances."""
         if self.config.reward == "paper":
-            distance = (self.tip() - self.goal).abs().sum(dim=1)
+            distance = in_order((self.tip() - self.goal).abs().unbind(dim=1))
         return (distance <= self.config.success_tolerance) & (self.angle() <= self.config.axis_tolerance)
 
     def is_terminated(self, distance: Tensor) -> Tensor:
@@ -339,8 +339,8 @@ class TrunkCup(CableReach):
         """See the table at the top."""
         config = self.config
         if config.reward == "paper":
-            way = torch.linalg.vector_norm(self.start_tip - self.goal, dim=-1)
-            left = (self.tip() - self.goal).abs().sum(dim=1)
+            way = length_of(self.start_tip - self.goal)
+            left = in_order((self.tip() - self.goal).abs().unbind(dim=1))
             return {"way": (way - left) / MILLIMETRE, "success": self.is_success(distance).float()}
         error = self.pose_error()
         terms = {
@@ -376,14 +376,14 @@ class TrunkCup(CableReach):
             self.goal - self.start_tip,
             self.goal_axis,
             error,
-            error / (error.norm(dim=-1, keepdim=True) + FINE_ERROR),
+            error / (length_of(error)[:, None] + FINE_ERROR),
             turn,
-            turn / (turn.norm(dim=-1, keepdim=True) + FINE_TURN),
+            turn / (length_of(turn)[:, None] + FINE_TURN),
             self.command,
             self.command - self._first_command,
             self.sim.cable_tension,
             stations[:, self._stations].flatten(1),
-            in_order(self.sim.contact_load.norm(dim=-1).unbind(dim=1))[:, None],
+            in_order(length_of(self.sim.contact_load).unbind(dim=1))[:, None],
         )
         return {"observation": torch.cat(parts, dim=1).to(torch.float32) * self._scale}
 
