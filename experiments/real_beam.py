@@ -39,9 +39,7 @@ PULL = 0.2  # N, on the end, of the shape that rings
 HIGHER = 1.2  # than the first lower peak is deep, the motion starts
 PERIODS = 5.9  # to look at
 SLOWEST = 4.1  # Hz
-STATIC, PEAK = (0.014, 0.03), (0.03, 0.05)  # parts of the figure and mm that runs and markers differ by
-FREQUENCY = 0.01  # part of the figure
-STATIC_BAR, FREQUENCY_BAR, PEAK_BAR = {"none": 0.2}, 0.02, 0.05  # mm of marker 2 (others 0.4); parts of the figure
+STATIC_BAR, FREQUENCY_BAR, PEAK_BAR = {"none": 0.2}, 0.02, 0.05  # mm (others 0.4); parts of the figure
 MARKER = 1  # the one that bars are for
 
 PARAMETERS = [
@@ -198,17 +196,21 @@ class Case:
         return fit(PARAMETERS, residuals, batch=CANDIDATES, **{"tolerance": 1e-2, "max_iterations": 6, **options})
 
     def _residuals(self, loads: list[dict[str, Any]]) -> Floats:
-        """Differences in units of what they may be."""
+        """Squares of differences in units of what they may be, with their signs.
+
+        What is asked for are largest errors, so the fit heeds large ones more than a sum of squares would.
+        """
         parts: list[Floats] = []
         for name, found in zip(self.fitted, loads, strict=True):
             told = self.loads[name]
             heights = np.array(list(told["static"].values()))
-            parts.append((found["rest"] - heights) / np.hypot(STATIC[0] * heights, STATIC[1]))
-            parts.append(np.array([(found["frequency"] / told["frequency"] - 1.0) / FREQUENCY]))
+            parts.append((found["rest"] - heights) / STATIC_BAR.get(name, 0.4))
+            parts.append(np.array([(found["frequency"] / told["frequency"] - 1.0) / FREQUENCY_BAR]))
             peaks, known = np.full(len(told["peaks"]), np.nan), np.array(told["peaks"])
             peaks[: len(found["peaks"])] = found["peaks"]
-            parts.append(((peaks - known) / np.hypot(PEAK[0] * known, PEAK[1]))[1:])
-        return np.concatenate(parts)
+            parts.append(((peaks - known) / (PEAK_BAR * known))[1:])
+        errors = np.concatenate(parts)
+        return errors * np.abs(errors)
 
 
 def identify(extra: Path | None = None, **options: Any) -> Fit:

@@ -21,6 +21,7 @@ HEAVY = 3.0  # extents of the scene by which no force needs to move what it acts
 LONGEST = 1000.0  # way, relative to the correction that it starts from
 DAMPING = 1.0e-5  # of the system's diagonal, for rows that repeat each other
 PIVOT = 1.0e-6  # least pivot, relative to the diagonal
+LOOSE = 0.97  # of its cone, from where a contact that sticks may soon slide
 ON_CONE = 1.0e-5  # relative distance from the cone within which a contact slides
 AGAIN = 8  # sweeps until a world with too many rows asks again: some of them open
 
@@ -139,75 +140,165 @@ for (int lane = 0; lane < LANES; ++lane) {
     }
 
     REAL near[MOST * WIDTH] __attribute__((aligned(64))), system[MOST * WIDTH] __attribute__((aligned(64)));
+    REAL whole[MOST * WIDTH] __attribute__((aligned(64)));
     const int chunks = (size + CHUNK - 1) / CHUNK;
     for (int p = 0; p < size; ++p) {
-        for (int q = 0; q < size; ++q) near[p * WIDTH + q] = ENTRY(at[p], at[q]);
+        for (int q = 0; q <= p; ++q) near[p * WIDTH + q] = near[q * WIDTH + p] = ENTRY(at[p], at[q]);
         for (int q = size; q < chunks * CHUNK; ++q) near[p * WIDTH + q] = 0;
         value[p] = VALUE(at[p]); slack[p] = GAP(at[p]);
     }
 
+    // Laws that may change soon stand last. The others are eliminated once, from rows of all.
+    bool is_loose[MOST], is_parted = false;
+    for (int l = 0; l < laws; ++l) {
+        const REAL* const t = value + first[l];
+        const REAL bound = LOOSE * mu_[l] * t[0];
+        is_loose[l] = law[l] == STICK && !(t[1] * t[1] + t[2] * t[2] < bound * bound);
+    }
+    int who[MOST], rank[MOST], settled = 0;  // size numbers in the order of elimination, and the first of each law
+    REAL inverse[MOST];  // one over each pivot
+
     bool is_lost = false;
     for (int event = 0; event < EVENTS; ++event) {
-        int unknowns = 0, kind[MOST], of[MOST], number[MOST];
-        REAL n1[MOST], n2[MOST], extra[MOST], right[MOST];  // by law, but for the last two, which go by unknowns
+        int unknowns = 0, plain = 0, kind[MOST], of[MOST], number[MOST], seat[MOST];
+        REAL n1[MOST], n2[MOST], extra[MOST];  // by law, but for the last
+        REAL goal[WIDTH] __attribute__((aligned(64)));
         for (int l = 0; l < laws; ++l) {
             const int p = first[l];
-            if (law[l] == FIXED || law[l] == OPEN) continue;
-            if (law[l] < OPEN) {
-                const REAL stop = law[l] == LOW ? ROW(floor, place[l]) : law[l] == HIGH ? ROW(ceiling, place[l]) : 0;
-                kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p; extra[unknowns] = soft[l];
-                right[unknowns++] = stop - slack[p] - soft[l] * value[p];
-                continue;
+            const REAL press = value[p];
+            goal[p] = -(slack[p] + soft[l] * press);
+            if (law[l] == LOW) goal[p] += ROW(floor, place[l]);
+            if (law[l] == HIGH) goal[p] += ROW(ceiling, place[l]);
+            if (span[l] == 3) {
+                goal[p + 1] = -slack[p + 1]; goal[p + 2] = -slack[p + 2];
+                const REAL t1 = value[p + 1], t2 = value[p + 2], length = __builtin_sqrt(t1 * t1 + t2 * t2);
+                const bool touches = length > 0 && length >= mu_[l] * press * (1 - ON_CONE);
+                if (law[l] == STICK && touches) law[l] = SLIDE;
+                if (law[l] == SLIDE && !(length > 0)) law[l] = STICK;
+                if (law[l] == SLIDE) { n1[l] = t1 / length; n2[l] = t2 / length; }
             }
-            const REAL press = value[p], t1 = value[p + 1], t2 = value[p + 2];
-            const REAL length = __builtin_sqrt(t1 * t1 + t2 * t2);
-            const bool touches = length > 0 && length >= mu_[l] * press * (1 - ON_CONE);
-            if (law[l] == STICK && touches) law[l] = SLIDE;
-            if (law[l] == SLIDE && !(length > 0)) law[l] = STICK;
-            kind[unknowns] = law[l] == SLIDE ? ALONG : PLAIN; of[unknowns] = l; number[unknowns] = p;
-            extra[unknowns] = soft[l]; right[unknowns++] = -(slack[p] + soft[l] * press);
-            if (law[l] == STICK)
-                for (int axis = 1; axis < 3; ++axis) {
-                    kind[unknowns] = PLAIN; of[unknowns] = l; number[unknowns] = p + axis;
-                    extra[unknowns] = 0; right[unknowns++] = -slack[p + axis];
-                }
-            if (law[l] == SLIDE) {
-                n1[l] = t1 / length; n2[l] = t2 / length;
-                const REAL slip = -(slack[p + 1] * n1[l] + slack[p + 2] * n2[l]) / length;
-                kind[unknowns] = ACROSS; of[unknowns] = l; number[unknowns] = p;
-                extra[unknowns] = SIZE(slip);
-                right[unknowns++] = n2[l] * slack[p + 1] - n1[l] * slack[p + 2];
-            }
+            const bool has_end = law[l] == FIXED || law[l] == OPEN || law[l] == SLIDE;
+            if (has_end && !is_loose[l]) { is_loose[l] = true; is_parted = false; }
         }
-        if (unknowns == 0) break;
+        for (int sliding = 0; sliding < 2; ++sliding) {
+            for (int l = 0; l < laws; ++l) {
+                if (!is_loose[l] || law[l] == FIXED || law[l] == OPEN || (law[l] == SLIDE) != (sliding > 0)) continue;
+                const int p = first[l], axes = law[l] == STICK ? 3 : law[l] == SLIDE ? 2 : 1;
+                for (int axis = 0; axis < axes; ++axis) {
+                    kind[unknowns] = law[l] != SLIDE ? PLAIN : axis == 0 ? ALONG : ACROSS;
+                    of[unknowns] = l; number[unknowns] = p + (law[l] == SLIDE ? 0 : axis);
+                    extra[unknowns++] = axis == 0 ? soft[l] : 0;
+                }
+                if (law[l] != SLIDE) continue;
+                const REAL slip = slack[p + 1] * n1[l] + slack[p + 2] * n2[l];
+                extra[unknowns - 1] = SIZE(slip) / (n1[l] * value[p + 1] + n2[l] * value[p + 2]);
+            }
+            if (sliding == 0) plain = unknowns;
+        }
+
+        if (!is_parted) {
+            is_parted = true;
+            int n = 0;
+            REAL least[MOST];
+            for (int loose = 0; loose < 2; ++loose) {
+                for (int l = 0; l < laws; ++l) {
+                    if (is_loose[l] != (loose > 0)) continue;
+                    rank[l] = n;
+                    for (int axis = 0; axis < span[l]; ++axis) {
+                        least[n] = axis == 0 ? soft[l] : 0;
+                        who[n++] = first[l] + axis;
+                    }
+                }
+                if (loose == 0) settled = n;
+            }
+            for (int i = 0; i < size; ++i) {
+                const REAL* const from = near + who[i] * WIDTH;
+                REAL* const line = whole + i * WIDTH;
+                for (int j = i / CHUNK * CHUNK; j < size; ++j) line[j] = from[who[j]];
+                for (int j = size; j < chunks * CHUNK; ++j) line[j] = 0;
+                if (i < settled) line[i] = line[i] * (1 + DAMPING) + least[i];
+                least[i] = PIVOT * SIZE(line[i]);
+            }
+            for (int k = 0; k < settled; k += 4) {  // four rows at a time, on two below, of which the right half counts
+                const int block = settled - k < 4 ? settled - k : 4;
+                const REAL* const top = whole + k * WIDTH;
+                for (int r = k; r < k + block; ++r) {
+                    wide_t* const line = (wide_t*)(whole + r * WIDTH);
+                    for (int m = 0; m < r - k; ++m) {
+                        const REAL factor = top[m * WIDTH + r] * inverse[k + m];
+                        const wide_t* const above = (const wide_t*)(top + m * WIDTH);
+                        for (int chunk = r / CHUNK; chunk < chunks; ++chunk) line[chunk] -= above[chunk] * factor;
+                    }
+                    for (int j = r / CHUNK * CHUNK; j < r; ++j) whole[r * WIDTH + j] = 0;
+                    inverse[r] = SIZE(whole[r * WIDTH + r]) > least[r] ? 1 / whole[r * WIDTH + r] : 0;
+                }
+                for (int r = k + block; r < size; r += 2) {
+                    const int other = r + 1 < size ? r + 1 : r;
+                    part_t* const one = (part_t*)(whole + r * WIDTH);
+                    part_t* const two = (part_t*)(whole + other * WIDTH);
+                    const part_t* const above = (const part_t*)top;
+                    const int parts = CHUNK * sizeof(REAL) / sizeof(part_t), stride = parts * STRIDE;
+                    REAL a[4] = {}, b[4] = {};
+                    for (int m = 0; m < block; ++m) {
+                        a[m] = top[m * WIDTH + r] * inverse[k + m];
+                        b[m] = top[m * WIDTH + other] * inverse[k + m];
+                    }
+                    const int begin = r * sizeof(REAL) / sizeof(part_t);
+                    for (int part = begin; part < parts * chunks; ++part) {
+                        const part_t t0 = above[part], t1 = block > 1 ? above[part + stride] : t0;
+                        const part_t t2 = block > 2 ? above[part + 2 * stride] : t0;
+                        const part_t t3 = block > 3 ? above[part + 3 * stride] : t0;
+                        const part_t first = one[part] - ((t0 * a[0] + t1 * a[1]) + (t2 * a[2] + t3 * a[3]));
+                        two[part] -= (t0 * b[0] + t1 * b[1]) + (t2 * b[2] + t3 * b[3]);
+                        one[part] = first;
+                    }
+                }
+            }
+            for (int i = settled; i < size; ++i)
+                for (int j = settled; j < i; ++j) whole[i * WIDTH + j] = whole[j * WIDTH + i];
+        }
+        if (unknowns + settled == 0) break;
+
+        REAL z[WIDTH] __attribute__((aligned(64))) = {};
+        for (int i = 0; i < size; ++i) z[i] = goal[who[i]];
+        for (int k = 0; k < settled; ++k) {
+            const REAL factor = z[k] * inverse[k];
+            const REAL* const above = whole + k * WIDTH;
+            const REAL own = z[k];
+            for (int chunk = k / CHUNK; chunk < chunks; ++chunk)
+                ((wide_t*)z)[chunk] -= ((const wide_t*)above)[chunk] * factor;
+            z[k] = own;
+        }
 
         REAL x[MOST], least[MOST], line_[WIDTH] __attribute__((aligned(64)));
+        for (int u = 0; u < unknowns; ++u) seat[u] = rank[of[u]] + number[u] - first[of[u]];
         for (int u = 0; u < unknowns; ++u) {
             REAL* const line = system + u * WIDTH;
-            const REAL* from = near + number[u] * WIDTH;
+            const int l = of[u], here = seat[u];
+            const REAL* from = whole + here * WIDTH;
+            const REAL* const own = near + number[u] * WIDTH + first[l];
+            REAL hard = near[number[u] * WIDTH + number[u]], right = z[here];
+            if (kind[u] == ALONG) hard = own[0] + mu_[l] * (n1[l] * own[1] + n2[l] * own[2]);
             if (kind[u] == ACROSS) {
-                const REAL c1 = -n2[of[u]], c2 = n1[of[u]];
-                for (int chunk = 0; chunk < chunks; ++chunk)
+                const REAL c1 = -n2[l], c2 = n1[l];
+                for (int chunk = settled / CHUNK; chunk < chunks; ++chunk)
                     ((wide_t*)line_)[chunk] = ((const wide_t*)(from + WIDTH))[chunk] * c1
                                             + ((const wide_t*)(from + 2 * WIDTH))[chunk] * c2;
                 from = line_;
+                hard = c1 * (c1 * own[WIDTH + 1] + c2 * own[WIDTH + 2])
+                     + c2 * (c1 * own[2 * WIDTH + 1] + c2 * own[2 * WIDTH + 2]);
+                right = c1 * z[here + 1] + c2 * z[here + 2];
             }
-            REAL* to = line;
-            for (int l = 0; l < laws; ++l) {
-                const REAL* const a = from + first[l];
-                if (law[l] == STICK) {
-                    to[0] = a[0]; to[1] = a[1]; to[2] = a[2];
-                    to += 3;
-                } else if (law[l] == SLIDE) {
-                    to[0] = a[0] + mu_[l] * (n1[l] * a[1] + n2[l] * a[2]); to[1] = n1[l] * a[2] - n2[l] * a[1];
-                    to += 2;
-                } else if (law[l] != FIXED && law[l] != OPEN) {
-                    *to++ = a[0];
-                }
+            for (int v = 0; v < plain; ++v) line[v] = from[seat[v]];
+            for (int v = plain; v < unknowns; v += 2) {
+                const REAL* const a = from + seat[v];
+                const int m = of[v];
+                line[v] = a[0] + mu_[m] * (n1[m] * a[1] + n2[m] * a[2]);
+                line[v + 1] = n1[m] * a[2] - n2[m] * a[1];
             }
-            line[u] = line[u] * (1 + DAMPING) + extra[u];
-            least[u] = PIVOT * SIZE(line[u]);
-            line[unknowns] = right[u];
+            line[u] += hard * DAMPING + extra[u];
+            least[u] = PIVOT * SIZE(hard * (1 + DAMPING) + extra[u]);
+            line[unknowns] = right;
             for (int v = unknowns + 1; v % CHUNK; ++v) line[v] = 0;
         }
         const int end = (unknowns + CHUNK) / CHUNK;
@@ -249,15 +340,27 @@ for (int lane = 0; lane < LANES; ++lane) {
             }
         }
         REAL sum = 0, step[WIDTH] = {};
+        for (int i = settled; i < size; ++i) z[i] = 0;
         for (int k = unknowns - 1; k >= 0; --k) {
             x[k] *= system[k * WIDTH + unknowns];
             for (int r = 0; r < k; ++r) system[r * WIDTH + unknowns] -= system[r * WIDTH + k] * x[k];
             sum += x[k];
-            const int p = number[k], l = of[k];
-            if (kind[k] == PLAIN) { step[p] += x[k]; continue; }
+            const int l = of[k], q = seat[k];
+            if (kind[k] == PLAIN) { z[q] += x[k]; continue; }
             const REAL c1 = kind[k] == ALONG ? mu_[l] * n1[l] : -n2[l], c2 = kind[k] == ALONG ? mu_[l] * n2[l] : n1[l];
-            step[p] += kind[k] == ALONG ? x[k] : 0; step[p + 1] += c1 * x[k]; step[p + 2] += c2 * x[k];
+            z[q] += kind[k] == ALONG ? x[k] : 0; z[q + 1] += c1 * x[k]; z[q + 2] += c2 * x[k];
         }
+        for (int k = settled - 1; k >= 0; --k) {
+            wide_t sums = {};
+            REAL rest = z[k];
+            z[k] = 0;
+            for (int chunk = k / CHUNK; chunk < chunks; ++chunk)
+                sums += ((const wide_t*)(whole + k * WIDTH))[chunk] * ((const wide_t*)z)[chunk];
+            for (int i = 0; i < CHUNK; ++i) rest -= sums[i];
+            z[k] = rest * inverse[k];
+            sum += z[k];
+        }
+        for (int i = 0; i < size; ++i) step[who[i]] = z[i];
         is_lost = !(sum < ENDLESS && sum > -ENDLESS);
         if (is_lost) break;
 
@@ -391,6 +494,7 @@ def _constants(lanes: int, first_state: int, first_vector: int) -> str:
         "LONGEST",
         "DAMPING",
         "PIVOT",
+        "LOOSE",
         "ON_CONE",
         "AGAIN",
     )
