@@ -116,15 +116,17 @@ class QuasiStatic:
         return merit.astype(np.float64), frozen > 0.5
 
     def lost(self) -> NDArray[np.bool_]:
-        """Worlds whose path has ended short of the commands: they slide, or their strides are the shortest.
+        """Worlds whose path has ended short of the commands, or that come no nearer at its end.
+
+        The first ones slide, or their strides are the shortest.
 
         To be asked before ``finish``; reads back to the host.
         """
         values = self.work.control.real.numpy()
-        names = (statics.FROZEN, statics.LOADED, statics.STRIDE, statics.T)
-        frozen, loaded, stride, t = (values[:, row, :].reshape(-1)[: self.system.world_count] for row in names)
+        names = (statics.FROZEN, statics.LOADED, statics.STRIDE, statics.T, statics.STUCK)
+        frozen, loaded, stride, t, stuck = (values[:, row, :].reshape(-1)[: self.system.world_count] for row in names)
         short = (stride <= 1.01 * statics.MIN_STRIDE) & (t < 1.0)
-        return np.asarray((frozen < 0.5) & ((loaded > 0.5) | short))
+        return np.asarray(((frozen < 0.5) & ((loaded > 0.5) | short)) | (stuck > 0.5))
 
     def _load(self) -> None:
         """Forces and commands at the present positions."""
