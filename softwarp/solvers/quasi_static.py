@@ -97,6 +97,20 @@ class QuasiStatic:
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
         s.each_real(self.k.measure, None, inputs, [w.control.real])
 
+    def saddles(self) -> NDArray[np.bool_]:
+        """Worlds whose state is an equilibrium that is not stable, were it one, shape (world,); reads back to the host.
+
+        A has more negative pivots there than the rows hold back. Nothing of the state changes.
+        """
+        self.start()
+        self.evaluate()
+        self._tangent()
+        self._solve()
+        pivots, held, steps = (rows.real.numpy() for rows in (self.lu.pivot, self.contact, self.work.u))
+        unstable = pivots[:, : self.system.model.dof_count].sum(axis=1) - held[:, 0]
+        is_sound = np.isfinite(steps).all(axis=1)
+        return np.asarray((is_sound & (unstable > 0.5)).reshape(-1)[: self.system.world_count])
+
     def finish(self) -> None:
         """Commit the last iterates with zero velocity.
 
