@@ -116,6 +116,7 @@ def tet_column(kind: str, material: Any) -> tuple[Any, torch.Tensor]:
                 ("contact", sw.StableNeoHookean(SOFT, 0.3)),
                 ("chamber", sw.StableNeoHookean(SOFT, 0.3)),
                 ("elastic cable", sw.Corotational(SOFT, 0.3)),
+                ("body", sw.Corotational(SOFT, 0.3, method="polar")),
                 ("chamber", sw.Corotational(SOFT, 0.3)),
             )
         ),

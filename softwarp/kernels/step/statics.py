@@ -27,7 +27,7 @@ MIN_STRIDE = 0.003  # of t
 MIN_MASS = 3.0e-4  # E / (rho extent^2): first pseudo-mass
 FREE, PULLED, PRESSED = range(3)  # rows: no force imposed; a tension, the upper bound; a pressure, both bounds
 STALL_LIMIT = 5  # iterations without progress after which a world that is within rounding counts as converged
-STUCK_LIMIT = 25  # the same for a world above rounding, which comes no nearer on this way
+STUCK_LIMIT = 40  # the same for a world above rounding, which comes no nearer on this way
 
 
 @single_worlds
