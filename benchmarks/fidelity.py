@@ -1,12 +1,14 @@
-"""What a robot's fidelity costs and brings: the trunk's meshes and elements, their time and their distance from truth.
+"""What a robot's fidelity costs and brings: meshes and elements, their time and their distance from truth.
 
-    softwarp bench fidelity                                # one world on one core, 64 on all
+    softwarp bench fidelity                                # the trunk; one world on one core, 64 on all
+    softwarp bench fidelity --robots Tripod CatchTheObject
     softwarp bench fidelity --worlds 4096 --device cuda:0
 
-Truth is the static shape of ``meshing.round_trunk("fine")``, whose grooves bend as converged ones do, in float64 under
-weights that sag, tilt, lift and compress it. The error is the distance of tips over the tip's way from the unloaded
-shape. Times are of steps in which cables move, variants in turns; ratios are medians over repetitions of the time over
-that of the default in the same one.
+Truth is the static shape of the finest affordable quadratic elements, in float64 under loads of fidelity_robots.py; for
+the trunk it is ``meshing.round_trunk("fine")``, whose grooves bend as converged ones do. The error is the distance of
+the point that is looked at over its way from the unloaded shape. Times are of steps of the whole scene in which
+actuators move, variants in turns; ratios are medians over repetitions of the time over that of the default in the same
+one.
 """
 
 from __future__ import annotations
@@ -19,63 +21,43 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
-from numpy.typing import NDArray
 
 import softwarp
-from softwarp.envs.options.trunk import TrunkSceneConfig
-from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
-from softwarp.meshing.trunk_geometry import LENGTH
 
-from . import trunk
+from .fidelity_robots import ROBOTS, Options, Robot
 from .timing import limited_cores, machine, save
 
-VARIANTS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "warped": {"rotation": "warped", "lumping": "volume"},
-    "fine": {"mesh": "fine", "rotation": "warped", "lumping": "volume"},
-    "accurate": {"fidelity": "accurate"},
-}
-TRUTH = {"mesh": "round fine", "element": "p2", "rotation": "warped"}
-GRAVITY = ((0.0, -9.81, 0.0), (0.0, -2.0, 0.0), (0.0, 5.0, 5.0), (5.0, -5.0, 7.0), (-7.0, 0.0, 5.0))  # m/s^2
 DRIVEN = 20  # steps before the first repetition
 
 
-def tips(options: dict[str, Any]) -> NDArray[np.float64]:
-    """Where the tip rests without cables under each of ``GRAVITY`` [m], (case, 3)."""
-    config = TrunkSceneConfig(**options)
-    builder = softwarp.ModelBuilder()
-    body = builder.add_tets(
-        trunk_mesh(config),
-        material=softwarp.Corotational(config.youngs, config.nu, method=config.rotation),  # type: ignore[arg-type]
-        element=config.element,  # type: ignore[arg-type]
-        total_mass=config.total_mass,
-        lumping=config.lumping if config.element == "p1" else "volume",  # type: ignore[arg-type]
-    )
-    builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, config.fixed_length + 1.0e-9)))
-    builder.add_marker(body, (0.0, 0.0, LENGTH))
-    sim = softwarp.Simulation(builder.finalize(len(GRAVITY), "cpu", "float64"))
-    sim.params.gravity.copy_(torch.tensor(GRAVITY))
-    sim.solve_static()
-    return np.asarray(sim.marker_x[:, 0])
-
-
-def build(options: dict[str, Any], worlds: int, device: str) -> softwarp.Simulation:
-    """The trunk of a variant, bent by its cables."""
-    builder = softwarp.ModelBuilder(gravity=(0.0, -9.81, 0.0))
-    build_trunk_scene(TrunkSceneConfig(**options), builder)
+def build(robot: Robot, options: Options, worlds: int, device: str) -> softwarp.Simulation:
+    """The scene of a variant, moved by its actuators."""
+    builder = softwarp.ModelBuilder(gravity=robot.gravity)
+    robot.scene(options, builder)
     sim = softwarp.Simulation(builder.finalize(worlds, device))
     for step in range(DRIVEN):
-        trunk.drive(sim, step)
+        robot.drive(sim, step)
         sim.step()
     return sim
 
 
-def measure(worlds: int, device: str, repeats: int) -> list[dict[str, Any]]:
+def measured_errors(name: str) -> dict[str, list[float]]:
+    """Distances from truth of all variants of a robot [%], printed as they are found."""
+    robot, errors = ROBOTS[name], {}
+    truth, start = robot.rest(robot.truth)
+    way = np.linalg.norm(truth - start, axis=1)
+    for variant, options in robot.variants.items():
+        errors[variant] = (100.0 * np.linalg.norm(robot.rest(options)[0] - truth, axis=1) / way).round(1).tolist()
+        told = ", ".join(f"{error:.1f}" for error in errors[variant])
+        print(f"{name:14s} {variant:10s} off by {told} %", flush=True)
+    return errors
+
+
+def measure(robot: Robot, worlds: int, device: str, repeats: int) -> list[dict[str, Any]]:
     """Records of all variants: median time of a step [ms] and its ratio to that of the default."""
-    sims = {name: build(options, worlds, device) for name, options in VARIANTS.items()}
-    times: dict[str, list[float]] = {name: [] for name in VARIANTS}
+    sims = {name: build(robot, options, worlds, device) for name, options in robot.variants.items()}
+    times: dict[str, list[float]] = {name: [] for name in robot.variants}
     steps = max(2, 40 // worlds)
     for _ in range(repeats):
         for name, sim in sims.items():
@@ -102,6 +84,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="softwarp bench fidelity", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=["Trunk"])
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 64])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--cores", type=int, help="of the CPU to use; one for one world, else all")
@@ -109,23 +92,19 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--no-statics", action="store_true", help="times only; truth takes some minutes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the records")
     args = parser.parse_args(arguments)
-    errors: dict[str, list[float]] = {}
-    if not args.no_statics:
-        truth = tips(TRUTH)
-        way = np.linalg.norm(truth - [0.0, 0.0, LENGTH], axis=1)
-        for name, options in VARIANTS.items():
-            errors[name] = (100.0 * np.linalg.norm(tips(options) - truth, axis=1) / way).round(1).tolist()
-            print(f"{name:10s} tips off by {', '.join(f'{error:.1f}' for error in errors[name])} %", flush=True)
     records = []
-    for worlds in args.worlds:
-        with limited_cores(args.cores or (1 if worlds == 1 else None)) as cores:
-            for record in measure(worlds, args.device, args.repeats):
-                print(
-                    f"{record['variant']:10s} {record['nodes']:5d} nodes {worlds:5d} worlds: "
-                    f"{record['ms_per_step']:8.3f} ms a step, {record['world_steps_per_s']:9.0f} world-steps/s, "
-                    f"{record['ratio']:5.2f} x default"
-                )
-                told = {"errors_percent": errors.get(record["variant"])}
-                records.append(record | told | machine(args.device, cores))
+    for name in args.robots:
+        errors = {} if args.no_statics else measured_errors(name)
+        for worlds in args.worlds:
+            with limited_cores(args.cores or (1 if worlds == 1 else None)) as cores:
+                for record in measure(ROBOTS[name], worlds, args.device, args.repeats):
+                    print(
+                        f"{name:14s} {record['variant']:10s} {record['nodes']:5d} nodes {worlds:5d} worlds: "
+                        f"{record['ms_per_step']:8.3f} ms a step, {record['world_steps_per_s']:9.0f} world-steps/s, "
+                        f"{record['ratio']:5.2f} x default",
+                        flush=True,
+                    )
+                    told = {"robot": name, "errors_percent": errors.get(record["variant"])}
+                    records.append(record | told | machine(args.device, cores))
     save(records, args.json)
     return 1 if any(record["failed_worlds"] for record in records) else 0

@@ -12,14 +12,14 @@ import numpy as np
 import warp as wp
 
 from softwarp import checks, interop, notices
-from softwarp.model.codes import StaticReason, Status
+from softwarp.model.codes import TURNED, StaticReason, Status
 from softwarp.model.model import Model
 from softwarp.plan.compile import coupled
 from softwarp.solvers.footprint import with_room
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
 from softwarp.solvers.quasi_static import QuasiStatic
-from softwarp.solvers.relaxation import AWAY, GOING_ON, NEWTON_ITERATIONS, Course, Relaxation
+from softwarp.solvers.relaxation import AWAY, GOING_ON, NEWTON_ITERATIONS, STRAYED, Course, Relaxation
 from softwarp.solvers.system import System
 from softwarp.static_advice import advice, departure
 from softwarp.threads import alone
@@ -184,6 +184,8 @@ class Statics:
         try:
             if not follows:
                 found = self._relax(tolerance, max_iterations, watch, everything)
+                if self._systems[0].has_exact_tangent:
+                    self._leave_saddles(found, tolerance, max_iterations, watch)
             else:
                 found = self._follow(tolerance, max_iterations, watch)
                 lost = found.reasons == StaticReason.NO_EQUILIBRIUM
@@ -196,15 +198,7 @@ class Statics:
     def _follow(self, tolerance: float | None, max_iterations: int, watch: _Watch) -> _Found:
         """``solve_static`` along the path of equilibria."""
         limit = (1e-9 if self.model.precision == "float64" else 1e-4) if tolerance is None else tolerance
-        if self._statics is None:
-            exact = replace(self.options, project_tangent=False)
-            model, index = self._coupled()
-
-            def make() -> list[QuasiStatic]:
-                return [QuasiStatic(s.with_options(exact, model, index, exact=True)) for s in self._systems]
-
-            self._statics = with_room(make, "solve_static", model, interop.empty_cache)
-        statics = self._statics
+        statics = self._paths()
         chunk = CHUNK if self.model.device.startswith("cuda") else 1
         iterations, late = 0, False
         with interop.on_torch_stream(self.model.device):
@@ -237,6 +231,47 @@ class Statics:
         reasons[statuses > Status.NONFINITE] = StaticReason.NO_EQUILIBRIUM  # it went away, as what nothing holds
         reasons[(statuses == Status.NONFINITE) | ~np.isfinite(merits)] = StaticReason.NOT_FINITE
         return _Found(np.where(np.isfinite(merits), merits, np.inf), iterations, reasons)
+
+    def _paths(self) -> list[QuasiStatic]:
+        """Solvers that follow paths; made once."""
+        if self._statics is None:
+            exact = replace(self.options, project_tangent=False)
+            model, index = self._coupled()
+
+            def make() -> list[QuasiStatic]:
+                return [QuasiStatic(s.with_options(exact, model, index, exact=True)) for s in self._systems]
+
+            self._statics = with_room(make, "solve_static", model, interop.empty_cache)
+        return self._statics
+
+    def _leave_saddles(self, found: _Found, tolerance: float | None, max_iterations: int, watch: _Watch) -> None:
+        """Worlds that steps have led to unstable equilibria, or to none, go on along a path if it ends in a stable one.
+
+        Tangents of steps leave out what softens a body under compression, so that steps creep about the straight shape
+        of a column that should have buckled, or call it an equilibrium. What is near an equilibrium that only seems
+        unstable, as one of a body that nothing holds, stays where it is.
+        """
+        try:
+            statics = self._paths()
+        except MemoryError:  # no room to look
+            return
+        with interop.on_torch_stream(self.model.device):
+            unstable = np.concatenate([static.saddles() for static in statics])
+        arrived = found.reasons <= StaticReason.ROUNDING
+        lost = np.isin(found.reasons, (StaticReason.NO_EQUILIBRIUM, StaticReason.ITERATION_LIMIT))
+        lost[list(found.departures)] = False
+        wanted = (arrived & unstable) | lost
+        if not wanted.any() or watch.over():
+            return
+        before = {name: view.clone() for name, view in self._views.items() if view.numel()}
+        other = self._follow(None, max_iterations, watch)
+        way = np.concatenate([self._ways(before, begin, end) for begin, end in self._bounds])
+        taken = wanted & (other.reasons <= StaticReason.ROUNDING) & (lost | (way > STRAYED))
+        with interop.on_torch_stream(self.model.device):
+            self._put_back(before, taken)
+            self._update_outputs()
+        if taken.any():
+            found.take(self._relax(tolerance, max_iterations, watch, taken), taken)
 
     def _relax(
         self, tolerance: float | None, max_iterations: int, watch: _Watch, wanted: np.ndarray[Any, Any]
@@ -297,15 +332,23 @@ class Statics:
         return self._exact
 
     def _has_exact_tangent(self) -> np.ndarray[Any, Any]:
-        """Worlds whose rods have an exact tangent, shape (world,): no cables, and no moments on nodes or bodies.
+        """Worlds whose steps can take an exact tangent that differs from the usual one, shape (world,).
 
-        What cables compress would be held by the stiffness of their tension, which A lacks here; and moments whose axes
-        stand in space have no symmetric tangent.
+        Rods have one, and hyperelastic bodies. What cables compress would be held by the stiffness of their tension,
+        which A lacks here: they must lie on other parts. Moments whose axes stand in space have no symmetric tangent.
         """
-        if self.model.segment_count == 0 or self.model.cable_count > 0:
+        m = self.model
+        has_solids = any(law not in TURNED for law in self._laws()) and m.membranes is None and m.reduction is None
+        is_pulled = m.cable_count > 0 and (m.segment_count == 0 or m.point_node.numpy().max() >= m.own_node_count)
+        if is_pulled or not (m.segment_count or has_solids):
             return np.zeros(self.model.num_worlds, dtype=bool)
         moments = [force[..., 3:].flatten(1).any(dim=1) for force in (self.control.body_force, self.control.rod_force)]
         return np.asarray(~(moments[0] | moments[1]).cpu().numpy())
+
+    def _laws(self) -> set[str]:
+        """Laws of soft bodies, by element."""
+        quadratic = self.model.quadratic
+        return {*self.model.law_tets, *(() if quadratic is None else quadratic.law_points)}
 
     def _advance_group(
         self,

@@ -97,6 +97,20 @@ class QuasiStatic:
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
         s.each_real(self.k.measure, None, inputs, [w.control.real])
 
+    def saddles(self) -> NDArray[np.bool_]:
+        """Worlds whose state is an equilibrium that is not stable, were it one, shape (world,); reads back to the host.
+
+        A has more negative pivots there than the rows hold back. Nothing of the state changes.
+        """
+        self.start()
+        self.evaluate()
+        self._tangent()
+        self._solve()
+        pivots, held, steps = (rows.real.numpy() for rows in (self.lu.pivot, self.contact, self.work.u))
+        unstable = pivots[:, : self.system.model.dof_count].sum(axis=1) - held[:, 0]
+        is_sound = np.isfinite(steps).all(axis=1)
+        return np.asarray((is_sound & (unstable > 0.5)).reshape(-1)[: self.system.world_count])
+
     def finish(self) -> None:
         """Commit the last iterates with zero velocity.
 
@@ -116,15 +130,17 @@ class QuasiStatic:
         return merit.astype(np.float64), frozen > 0.5
 
     def lost(self) -> NDArray[np.bool_]:
-        """Worlds whose path has ended short of the commands: they slide, or their strides are the shortest.
+        """Worlds whose path has ended short of the commands, or that come no nearer at its end.
+
+        The first ones slide, or their strides are the shortest.
 
         To be asked before ``finish``; reads back to the host.
         """
         values = self.work.control.real.numpy()
-        names = (statics.FROZEN, statics.LOADED, statics.STRIDE, statics.T)
-        frozen, loaded, stride, t = (values[:, row, :].reshape(-1)[: self.system.world_count] for row in names)
+        names = (statics.FROZEN, statics.LOADED, statics.STRIDE, statics.T, statics.STUCK)
+        frozen, loaded, stride, t, stuck = (values[:, row, :].reshape(-1)[: self.system.world_count] for row in names)
         short = (stride <= 1.01 * statics.MIN_STRIDE) & (t < 1.0)
-        return np.asarray((frozen < 0.5) & ((loaded > 0.5) | short))
+        return np.asarray(((frozen < 0.5) & ((loaded > 0.5) | short)) | (stuck > 0.5))
 
     def _load(self) -> None:
         """Forces and commands at the present positions."""

@@ -43,6 +43,7 @@ IDLE = 10  # short steps that go nowhere, after which a world has arrived whose 
 STRAYED, DOUBTS = 1.0e-2, 40  # extents and steps: a world that goes less far in so many has arrived after all
 MOST_INDEFINITE = 6  # steps in a row, each shorter, after which the exact tangent is not to be trusted
 PUSH, MOST_PUSHES = 1.0e-4, 3  # of the extent: way of a push off an unstable equilibrium; in a solve
+LEAVING, SHY = 2.0, 3  # ratio of a way to the last but one of a world that leaves by itself; saddles before a push
 GOING_ON = -1  # instead of a reason
 
 
@@ -161,6 +162,7 @@ class Course:
         self.reason = np.full(worlds, GOING_ON)
         self.longest = np.where(settled > 0.0, settled, longest)
         self.push, self._pushes = np.zeros(worlds), np.zeros(worlds, dtype=int)
+        self._kept = np.full((worlds, 3), np.inf)  # ways of the last steps
         self._saddles, self._idle = np.zeros(worlds, dtype=int), np.zeros(worlds, dtype=int)
         self._last, self.gone = np.full(worlds, np.inf), np.zeros(worlds)
         self._longest, self._best, self._most = np.zeros(worlds), np.full(worlds, np.inf), np.zeros(worlds)
@@ -219,6 +221,7 @@ class Course:
         if kept:
             self.way[world] = way
             self.gone[world] = gone
+            self._kept[world] = *self._kept[world, 1:], way
         if kept and gone > AWAY:
             self.reason[world] = StaticReason.NO_EQUILIBRIUM
         elif fair and h >= self.longest[world]:
@@ -267,7 +270,8 @@ class Course:
         if self._strayed[world] > STRAYED:
             self._doubted[world] = GOING_ON
         elif self._doubts[world] >= DOUBTS and self.reason[world] in (GOING_ON, StaticReason.NO_EQUILIBRIUM):
-            self.reason[world] = self._doubted[world]
+            if not self._leaves(world):
+                self.reason[world] = self._doubted[world]
 
     def _try_other(self, world: int, is_settled: bool, indefinite: bool) -> bool:
         """Whether a step that did not converge is tried again with the other tangent, before a shorter one.
@@ -284,10 +288,19 @@ class Course:
         return True
 
     def _meet_saddle(self, world: int, indefinite: bool) -> None:
-        """A world at rest that no longer step can leave is pushed."""
+        """A world at rest that no longer step can leave is pushed, unless it leaves by itself.
+
+        That is the better way: loads that bend a column by a ten-millionth are felt then, and no push leads aside, from
+        where the softest of motions goes round the axis. Longer and shorter steps take turns there.
+        """
         if indefinite and self.way[world] <= self.rounding_way:
             self._saddles[world] += 1
-            self._push(world)
+            if self._saddles[world] > SHY and not self._leaves(world):
+                self._push(world)
+
+    def _leaves(self, world: int) -> bool:
+        """Whether ways grow from step to step."""
+        return bool(self._kept[world, 2] > LEAVING * self._kept[world, 0])
 
     def _push(self, world: int) -> None:
         """Give a world velocities in its next step."""
@@ -317,13 +330,20 @@ class Course:
         self._steady[world] = self._steady[world] + 1 if is_little else 0
         self._before[world] = self.h[world], way
         if self._steady[world] >= STEADY:
-            self.reason[world] = StaticReason.CONVERGED
+            self._settle(world, StaticReason.CONVERGED)
         is_idle = frozen and way <= self.tolerance and self.h[world] >= FIRST_STEP
         self._idle[world] = self._idle[world] + 1 if is_idle else 0
         if not is_idle:
             self._saddles[world] = 0
-        elif self._idle[world] >= IDLE and (is_long or self._saddles[world] >= STEADY):
-            self.reason[world] = StaticReason.ROUNDING
+        elif self._idle[world] >= IDLE and (is_long or self._pushes[world] >= MOST_PUSHES):
+            self._settle(world, StaticReason.ROUNDING)
+
+    def _settle(self, world: int, reason: StaticReason) -> None:
+        """It has arrived; where the tangent has been indefinite, only if it comes back from pushes."""
+        if self._doubted[world] == GOING_ON or self._pushes[world] >= MOST_PUSHES:
+            self.reason[world] = reason
+        else:
+            self._push(world)
 
     def _arrive(self, world: int, status: int, frozen: bool, way: float) -> None:
         """A step as long as they get: whether the world stands still.

@@ -59,7 +59,7 @@ def build_catch_scene(config: CatchSceneConfig, builder: ModelBuilder, *, ball_h
     cart = builder.add_rigid(cart_shape(), kinematic=True, name="cart")
     pads, chambers = [], []
     for side, name in ((-1.0, "left"), (1.0, "right")):
-        pad, chamber = _add_pad(config, builder, side, name)
+        pad, chamber = add_pad(config, builder, side, name)
         pads.append(pad)
         chambers.append(chamber)
     for part in (*pads, cart):
@@ -67,7 +67,7 @@ def build_catch_scene(config: CatchSceneConfig, builder: ModelBuilder, *, ball_h
     return CatchScene((pads[0], pads[1]), (chambers[0], chambers[1]), ball, cart)
 
 
-def _add_pad(config: CatchSceneConfig, builder: ModelBuilder, side: float, name: str) -> tuple[int, int]:
+def add_pad(config: CatchSceneConfig, builder: ModelBuilder, side: float, name: str) -> tuple[int, int]:
     """One pad on a side of the x axis, clamped, with its chamber."""
     if config.mesh not in RESOLUTIONS:
         raise ValueError(f"unknown pad mesh {config.mesh!r}; {nearest(config.mesh, RESOLUTIONS)}")

@@ -15,8 +15,8 @@ from softwarp.kernels.step import newton
 
 # Rows of the per-world control array; the first ones are shared with Newton's method in a step.
 MERIT, IMBALANCE, FROZEN, BEST, STALL = newton.MERIT, newton.IMBALANCE, newton.FROZEN, newton.BEST, newton.STALL
-PSEUDO_MASS, T, T_GOOD, STRIDE, CORRECTIONS, LAST, SPREAD, BAD, FRACTION, GOOD, BACK, LOADED, PREDICTED, ROWS = (
-    newton.ROWS + i for i in range(14)
+PSEUDO_MASS, T, T_GOOD, STRIDE, CORRECTIONS, LAST, SPREAD, BAD, FRACTION, GOOD, BACK, LOADED, PREDICTED, STUCK, ROWS = (
+    newton.ROWS + i for i in range(15)
 )
 
 CONTRACTION = 0.5  # from correction to correction, or on average since the prediction, that counts as converging
@@ -27,6 +27,7 @@ MIN_STRIDE = 0.003  # of t
 MIN_MASS = 3.0e-4  # E / (rho extent^2): first pseudo-mass
 FREE, PULLED, PRESSED = range(3)  # rows: no force imposed; a tension, the upper bound; a pressure, both bounds
 STALL_LIMIT = 5  # iterations without progress after which a world that is within rounding counts as converged
+STUCK_LIMIT = 40  # the same for a world above rounding, which comes no nearer on this way
 
 
 @single_worlds
@@ -54,8 +55,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         control_out: wp.array3d(dtype=real),
     ):
-        """Look at every world with its whole load; one that stopped half way goes back to its last good point."""
+        """Look at every world with its whole load; one that stopped half way goes back to its last good point.
+
+        Those that were stopped because they came no nearer have not converged.
+        """
         pack, lane = wp.tid()
+        if control_out[pack, wp.static(STUCK), lane] > real(0.5):
+            control_out[pack, wp.static(FROZEN), lane] = real(0.0)
         control_out[pack, wp.static(GOOD), lane] = real(0.0)
         control_out[pack, wp.static(FRACTION), lane] = real(0.0)
         is_short = control_out[pack, wp.static(T), lane] < real(1.0)
@@ -167,6 +173,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         The distance is the length of the Newton step; steps that pseudo-mass shortened do not count. An imbalance that
         is within rounding and has stopped falling need not fall below the tolerance, if the last steps were all small.
+        One that has stopped falling above it stops the world as well: where cables alone hold a body that could move
+        as a whole, A is singular, and the rounding of its solutions is amplified.
         """
         pack, lane = wp.tid()
         control_out[pack, wp.static(FRACTION), lane] = real(0.0)
@@ -191,8 +199,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             is_still = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding and spread <= near
             has_mass = control_out[pack, wp.static(PSEUDO_MASS), lane] > real(0.0)
             is_there = largest <= near and (merit <= tolerance or is_still)
-            if is_there and wp.isfinite(total) and not has_mass:
+            is_stuck = stall >= real(wp.static(float(STUCK_LIMIT)))
+            if (is_there or is_stuck) and wp.isfinite(total) and not has_mass:
                 control_out[pack, wp.static(FROZEN), lane] = real(1.0)
+                control_out[pack, wp.static(STUCK), lane] = wp.where(is_there, real(0.0), real(1.0))
 
     @wp.func
     def go_back(control: wp.array3d(dtype=real), pack: int, lane: int):

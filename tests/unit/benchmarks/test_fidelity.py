@@ -1,0 +1,41 @@
+"""``softwarp bench fidelity``: errors and times of a robot's variants."""
+
+import json
+
+import numpy as np
+import pytest
+
+from softwarp import cli
+
+
+@pytest.mark.slow  # 15 s
+def test_errors_and_times(tmp_path, capsys, monkeypatch):
+    """A variant that is the truth is not off, a coarser one is; records tell times beside errors."""
+    fidelity, robots = (cli.script("benchmarks", name) for name in ("fidelity", "fidelity_robots"))
+    pad = robots.ROBOTS["CatchTheObject"]
+    small = {"mesh": "coarse", "element": "p2", "rotation": "warped"}
+    variants = {"default": {}, "p2": small}
+    monkeypatch.setitem(
+        fidelity.ROBOTS, "CatchTheObject", robots.Robot(pad.scene, pad.rest, small, variants, drive=pad.drive)
+    )
+    path = tmp_path / "records.json"
+    assert (
+        fidelity.main(
+            ["--robots", "CatchTheObject", "--worlds", "2", "--cores", "1", "--repeats", "1", "--json", str(path)]
+        )
+        == 0
+    )
+    default, p2 = json.loads(path.read_text())
+    assert (default["robot"], default["variant"], p2["variant"]) == ("CatchTheObject", "default", "p2")
+    assert default["ratio"] == 1.0 and p2["ratio"] > 1.0 and p2["nodes"] > 2 * default["nodes"]
+    assert max(p2["errors_percent"]) == 0.0 and min(default["errors_percent"]) > 10.0
+    assert "CatchTheObject default" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["Trunk", "Diamond", "Gripper", "Tripod"])
+def test_solids_are_held_and_bent(name):
+    """The point that is looked at moves a good way under every load, but not out of sight."""
+    robots = cli.script("benchmarks", "fidelity_robots")
+    places, start = robots.ROBOTS[name].rest(robots.ROBOTS[name].variants["default"])
+    ways = np.linalg.norm(places - start, axis=1)
+    assert (ways > 1e-3).all() and (ways < 0.3).all()
