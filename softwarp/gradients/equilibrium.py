@@ -24,9 +24,8 @@ from softwarp.solvers.static_adjoint import StaticAdjoint
 from softwarp.threads import Workers, alone
 
 Tensors = Mapping[str, torch.Tensor]
-RESTING = tuple(
-    name for name in PARAMETERS if name not in ("rayleigh_mass", "rayleigh_stiffness", "cable_damping", "pair_mu")
-)  # what an equilibrium depends on
+MOVING = ("rayleigh_mass", "rayleigh_stiffness", "relaxation_ratio", "relaxation_time", "cable_damping", "pair_mu")
+RESTING = tuple(name for name in PARAMETERS if name not in MOVING)  # what an equilibrium depends on
 FRAME_COMMANDS = ("body_force", "rod_force", "cable_tension")  # what rods and rigid bodies at rest depend on
 FRAME_PARAMETERS = ("rod_youngs", "rod_nu", "rod_density", "body_mass", "gravity")
 

@@ -90,9 +90,8 @@ def _options(options: Options) -> Iterator[str]:
 
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
-    if sim.model.has_moving_frames:
-        told = "rods, and rigid bodies that move or carry something, have no gradient with integrator 'bdf2' yet"
-        yield f"{told}; take integrator='euler'"
+    if sim.model.joints is not None:
+        yield "joints have no gradient with integrator 'bdf2' yet; take integrator='euler'"
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
     if sim.model.contact is not None:
         yield f"contact {told}"
@@ -144,9 +143,11 @@ def _parts(model: Model) -> Iterator[str]:
         yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
     if model.reduction is not None:
         yield "reduced bodies have no gradient yet; take the full mesh"
-    if model.relaxes:
+    if model.relaxes and (model.joints is not None or model.contact is not None):
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
-        yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
+        other = "joints" if model.joints is not None else "contact"
+        told = f"the relaxation of body {model.body_names[body]!r} beside {other} has no gradient yet"
+        yield f"{told}; leave its Maxwell branch out"
 
 
 def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
@@ -156,8 +157,6 @@ def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
         names += [f"node {node} of rod {rod!r}" for node in range(count)]
     if frames.blend_frame.size:
         yield "a rod that contact cuts into pieces has no gradient yet; leave contact_pieces out"
-    if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
-        yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
     if model.contact is not None:
         yield from _carriers_of_touching(model, frames, names)
 

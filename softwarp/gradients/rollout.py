@@ -197,7 +197,7 @@ class Rollout:
         step = torch.arange(plan.every, plan.steps + 1, plan.every)
         x, v, tension, pressure = kept[: len(STATE)]
         model, frames = self.worlds.model, dict(zip(FRAMES, kept[len(STATE) :], strict=False))
-        if not frames:
+        if not model.has_moving_frames:
             frames = {name: x.new_empty((*x.shape[:-2], 0, width)) for name, width in zip(FRAMES, (7, 6), strict=True)}
         rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
         pose, twist = (frames[name][..., rods, :] for name in FRAMES)

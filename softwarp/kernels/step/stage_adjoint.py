@@ -9,47 +9,28 @@ by M, by x, and by K and H. With s = A p, the seed less h H' q, K p is (s - m M 
 State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.elements import rod_adjoint
+from softwarp.kernels.frames import adjoint as of_frames
+from softwarp.model.codes import Spin
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     real = variant.real
     module = variant.module("adjoint.stage")
     one = single.functions(variant)
-    vec3, vector_at, put = one.vec3, one.vector_at, one.put
-
-    @wp.kernel(module=module, enable_backward=False)
-    def velocities(
-        h: real,
-        # Model
-        node_dof: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        # Workspace in
-        beta_in: wp.array3d(dtype=real),
-        node_v_in: wp.array3d(dtype=real),
-        start_v_in: wp.array3d(dtype=real),
-        # Workspace out
-        element_v_out: wp.array3d(dtype=real),
-        row_v_out: wp.array3d(dtype=real),
-    ):
-        """What elements and rows have in the place of the velocity of one node; ``start_v_in`` is of dofs."""
-        pack, node, lane = wp.tid()
-        v = vector_at(node_v_in, pack, lane, 3 * node)
-        dof = node_dof[node]
-        v0 = vec3()
-        if dof >= 0:
-            v0 = vector_at(start_v_in, pack, lane, 3 * dof)
-        share = h / (h + beta_in[pack, node_body[node], lane])
-        put(element_v_out, pack, lane, 3 * node, v - share * v0)
-        put(row_v_out, pack, lane, 3 * node, v - v0)
+    vec3, quat, vector_at, put = one.vec3, one.quat, one.vector_at, one.put
+    exponential, logarithm = one.exponential, one.logarithm
+    turns, of_rods = of_frames.functions(variant), rod_adjoint.functions(variant)
+    turn_bar, jacobian_transposed = turns.turn_bar, turns.jacobian_transposed
+    slopes, twisted = of_rods.slopes, of_rods.twisted
 
     @wp.kernel(module=module, enable_backward=False)
     def start_points(
@@ -123,38 +104,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 force_bar_out[world, row] = h * node_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
-    def damping(
-        h: real,
-        lanes: int,
-        # Model
-        body_node_start: wp.array(dtype=wp.int32),
-        node_dof: wp.array(dtype=wp.int32),
-        # Workspace in
-        density_in: wp.array3d(dtype=real),
-        beta_in: wp.array3d(dtype=real),
-        body_mass_in: wp.array3d(dtype=real),
-        pushed_in: wp.array3d(dtype=real),
-        start_v_in: wp.array3d(dtype=real),
-        node_mass_p_in: wp.array3d(dtype=real),
-        # State out
-        rayleigh_stiffness_bar_out: wp.array2d(dtype=real),
-    ):
-        """Make the gradient by beta of one body that of h v, from that of h (v - h^2 / k v0) which elements gave."""
-        pack, body, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < rayleigh_stiffness_bar_out.shape[0]:
-            total = real(0.0)
-            for node in range(body_node_start[body], body_node_start[body + 1]):
-                dof = node_dof[node]
-                if dof >= 0:
-                    mass_p = density_in[pack, body, lane] * vector_at(node_mass_p_in, pack, lane, 3 * node)
-                    product = vector_at(pushed_in, pack, lane, 3 * dof) - body_mass_in[pack, body, lane] * mass_p
-                    total += wp.dot(product, vector_at(start_v_in, pack, lane, 3 * dof))
-            length = h + beta_in[pack, body, lane]
-            change = h / (length * length) * total  # h (h^2 / k) / k
-            rayleigh_stiffness_bar_out[world, body] = rayleigh_stiffness_bar_out[world, body] - change
-
-    @wp.kernel(module=module, enable_backward=False)
     def part(
         factor: real,
         # State
@@ -169,6 +118,67 @@ def kernels(variant: Variant) -> SimpleNamespace:
         part_out[world, row] = factor * bar
         rest_out[world, row] = bar - factor * bar
 
+    @wp.func
+    def turn_of(bar: wp.array2d(dtype=real), world: int, row: int, q: quat):
+        """Gradient by a turn from that by a quaternion."""
+        return turn_bar(q, vec3(bar[world, row], bar[world, row + 1], bar[world, row + 2]), bar[world, row + 3])
+
+    @wp.func
+    def put_turn(bar: wp.array2d(dtype=real), world: int, row: int, q: quat, turn: vec3):
+        """Gradient by a quaternion, along which it keeps its length, from that by a turn."""
+        found = quat(turn[0], turn[1], turn[2], real(0.0)) * q * real(2.0)
+        for c in range(4):
+            bar[world, row + c] = found[c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def part_frames(
+        factor: real,
+        lanes: int,
+        # Model
+        frame_master: wp.array(dtype=wp.int32),
+        frame_spin: wp.array(dtype=wp.int32),
+        # State
+        pose0_in: wp.array2d(dtype=real),
+        pose1_in: wp.array2d(dtype=real),
+        # State out
+        pose_bar_out: wp.array2d(dtype=real),
+        twist_bar_out: wp.array2d(dtype=real),
+        pose_rest_out: wp.array2d(dtype=real),
+        twist_rest_out: wp.array2d(dtype=real),
+    ):
+        """The same of one frame, which is turned on about the axis of its turn so far; free tops are left out.
+
+        With q1 = exp(phi) q0 the frame is at exp(c phi) q0, and phi changes by T(phi)^-1 of the change of its exponential.
+        """
+        pack, frame, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < pose_bar_out.shape[0] and frame_master[frame] == frame:
+            if frame_spin[frame] != wp.static(Spin.FREE_TOP):
+                row = 7 * frame
+                for c in range(3):
+                    bar = pose_bar_out[world, row + c]
+                    pose_bar_out[world, row + c] = factor * bar
+                    pose_rest_out[world, row + c] = bar - factor * bar
+                for c in range(6):
+                    bar = twist_bar_out[world, 6 * frame + c]
+                    twist_bar_out[world, 6 * frame + c] = factor * bar
+                    twist_rest_out[world, 6 * frame + c] = bar - factor * bar
+                q0 = quat()
+                q1 = quat()
+                for c in range(4):
+                    q0[c] = pose0_in[world, row + 3 + c]
+                    q1[c] = pose1_in[world, row + 3 + c]
+                phi = logarithm(q1 * wp.quat_inverse(q0))
+                q = wp.normalize(exponential(phi * factor) * q0)
+                g = turn_of(pose_bar_out, world, row + 3, q)
+                by_phi = factor * jacobian_transposed(factor * phi, g)
+                curl, _ = slopes(wp.dot(phi, phi))
+                by_end = twisted(-phi, curl, by_phi)
+                by_start = wp.quat_rotate_inv(exponential(factor * phi), g)
+                by_start -= wp.quat_rotate_inv(exponential(phi), by_end)
+                put_turn(pose_bar_out, world, row + 3, q1, by_end)
+                put_turn(pose_rest_out, world, row + 3, q0, by_start)
+
     @wp.kernel(module=module, enable_backward=False)
     def add(
         # State
@@ -181,10 +191,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         sum_out[world, row] = sum_out[world, row] + bar_in[world, row]
 
     return SimpleNamespace(
-        velocities=velocities,
         start_points=start_points,
         nodes=nodes,
-        damping=damping,
         part=part,
+        part_frames=part_frames,
         add=add,
     )
