@@ -66,8 +66,8 @@ def require_static_gradient(sim: Simulation) -> None:
 def _resting_frames(sim: Simulation) -> Iterator[str]:
     """What equilibria of rods and rigid bodies have no gradient with."""
     model, told = sim.model, "equilibria of rods, and of rigid bodies that move or carry something, have no gradient"
-    if model.body_count:
-        yield f"{told} beside soft bodies yet"
+    if model.cavity_count:
+        yield f"{told} beside chambers yet"
     if model.joints is not None:
         yield f"{told} beside joints yet"
     if model.has_kinematic:
