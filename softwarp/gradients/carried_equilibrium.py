@@ -24,7 +24,7 @@ Tensors = Mapping[str, torch.Tensor]
 LONG = 1.0e3  # s, of a step without momentum, whose matrix is the tangent of the forces to rounding
 STEPS = 30  # such steps, at most
 CORRECTIONS = 100  # of an adjoint, at most
-WAY = {"float32": 3.0e-5, "float64": 1.0e-11}  # extents, and rad, of the last step
+WAY = {"float32": 3.0e-6, "float64": 1.0e-11}  # extents, and rad, of the last step
 LEFT = {"float32": 1.0e-4, "float64": 1.0e-12}  # of a gradient: what an adjoint may leave
 PLACES = ("node_x", "frame_pose")
 

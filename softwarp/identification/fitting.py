@@ -119,7 +119,7 @@ def fit(
             "to look for a start within the bounds"
         )
     if method == "gradient" and differentiable is not None:
-        end, centre = problem.slide(differentiable, u, tolerance, max_iterations)
+        end, centre = problem.slide(differentiable, u, centre, tolerance, max_iterations)
         if candidates.measurements > 2 * len(space) * differentiable.experiments:
             candidates.jacobian = None  # differences cost less than a backward pass for every measurement
     else:
@@ -207,12 +207,23 @@ class _Problem:
         return found, self._last[1]
 
     def slide(
-        self, residuals: Differentiable, u: FloatArray, tolerance: float, most: int
+        self, residuals: Differentiable, u: FloatArray, centre: FloatArray, tolerance: float, most: int
     ) -> tuple[SimpleNamespace, FloatArray]:
-        """Where a descent along gradients stopped and why, told as ``descend`` does, and the residuals there."""
-        space, worst = self.candidates.space, np.zeros(1)
+        """Where a descent along gradients stopped and why, told as ``descend`` does, and the residuals there.
 
-        def cost(place: FloatArray) -> tuple[float, FloatArray]:
+        Places are counted in steps of differences, so that the first way along a gradient is as long as one of these.
+        """
+        space, worst = self.candidates.space, np.zeros(1)
+        unit = space.steps()
+        start = np.clip(u, 0.0, 1.0)
+        first = start / unit
+        self._last = (start.tobytes(), centre)
+
+        def place_of(scaled: FloatArray) -> FloatArray:
+            return start if np.array_equal(scaled, first) else np.clip(scaled * unit, 0.0, 1.0)
+
+        def cost(scaled: FloatArray) -> tuple[float, FloatArray]:
+            place = place_of(scaled)
             r = self._at(place)
             if not np.isfinite(r).all():
                 return 10.0 * float(worst[0]), np.zeros(len(place))  # diverged: the line search comes back
@@ -221,16 +232,17 @@ class _Problem:
             by = np.zeros(len(self._last[1]))
             by[self.used] = self.weight * r
             values = space.values(place)
-            return 0.5 * float(r @ r), residuals.pull(values, by) * space.slopes(values)
+            return 0.5 * float(r @ r), residuals.pull(values, by) * space.slopes(values) * unit
 
         options = {"maxiter": most, "ftol": tolerance, "gtol": 1e-12}
         found = minimize(
-            cost, np.clip(u, 0.0, 1.0), jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(u), options=options
+            cost, first, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0 / step) for step in unit], options=options
         )
-        self._at(found.x)
+        x = place_of(found.x)
+        self._at(x)
         assert self._last is not None
-        is_at_bound = (found.x <= 0.0) | (found.x >= 1.0)
-        end = SimpleNamespace(x=found.x, status=2 if found.success else 0, active_mask=is_at_bound.astype(int))
+        is_at_bound = (x <= 0.0) | (x >= 1.0)
+        end = SimpleNamespace(x=x, status=2 if found.success else 0, active_mask=is_at_bound.astype(int))
         return end, self._last[1]
 
     def _at(self, u: FloatArray) -> FloatArray:
