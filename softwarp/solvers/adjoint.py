@@ -88,7 +88,8 @@ class StepAdjoint:
             self.surface = SurfaceAdjoint(s, m.cavities, h)
         self.margin, self.lapse, self.rate_lapse, self.is_stage = 0.0, h, h, False
         self.start = s.rows(rows)
-        self.displacement = s.work.displacement  # that commands are measured at
+        self.stretches = wp.array(m.cable_elastic, dtype=wp.int32, device=s.device)
+        self.displacement, self.volume = s.work.displacement, s.work.cavity_volume  # that commands are measured at
         self.final_v = s.work.dof_v
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
@@ -343,7 +344,7 @@ class StepAdjoint:
         """The same from q and the gradients by bounds."""
         s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
         limits = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
-        inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
+        inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control, self.stretches]
         inputs += [i["command_cable_displacement"].real, i["command_cable_tension"].real]
         inputs += [*(i[f"cable_{name}"].real for name in limits), self.displacement.real, w.lag.real]
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
@@ -351,24 +352,27 @@ class StepAdjoint:
         outputs += [self.measured.real, self.start.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cable_elastic.any():
-            inputs = [self.lapse, s.lanes, m.cable_force_control, i["cable_stiffness"].real, i["cable_damping"].real]
-            inputs += [w.compliance.real, w.target.real, w.displacement.real, w.multiplier.real, self.q.real]
-            outputs = [g.command_cable_displacement, g.cable_stiffness, g.cable_damping, self.measured.real]
+            inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
+            inputs += [i["cable_stiffness"].real, i["cable_damping"].real]
+            inputs += [w.compliance.real, w.target.real, self.displacement.real, w.multiplier.real, self.q.real]
+            outputs = [g.command_cable_displacement, g.cable_stiffness, g.cable_damping]
+            outputs += [self.measured.real, self.start.real]
             s.each_real(self.k_rows.cable_stretch, m.cable_count, inputs, outputs)
         if m.cavities is not None:
             self._to_chambers(m.cavities)
 
     def _to_chambers(self, c: CavityModel) -> None:
         s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
-        inputs = [self.h, self.lapse, s.lanes, m.first_row("cavity")]
+        inputs = [self.h, self.lapse, s.lanes, m.first_row("cavity"), self.is_stage]
         inputs += [c.cavity_control, c.cavity_area, c.cavity_rest_volume]
         inputs += [i[f"command_cavity_{name}"].real for name in ("pressure", "volume", "gas")]
         inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "min_volume", "max_volume")]
         inputs += [i[f"cavity_{name}"].real for name in ("max_pressure_rate", "max_flow", "ambient", "exponent")]
-        inputs += [i["pressure"].real, w.cavity_volume.real, w.cavity_goal.real, w.lag.real]
+        inputs += [i["pressure"].real, self.volume.real, w.cavity_volume.real, w.cavity_goal.real, w.lag.real]
         inputs += [w.multiplier.real, self.q.real, self.bound.real]
         outputs = [g.command_cavity_pressure, g.command_cavity_volume, g.command_cavity_gas, g.cavity_pressure]
-        s.each_real(self.k_chambers.cavity_command, m.cavity_count, inputs, [*outputs, self.measured.real])
+        outputs += [self.measured.real, self.start.real]
+        s.each_real(self.k_chambers.cavity_command, m.cavity_count, inputs, outputs)
 
     def _to_elements(self, *, parameters: bool = True) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h

@@ -58,6 +58,7 @@ class StageAdjoint(StepAdjoint):
         if self.frames is not None:
             self.frames.end_v = self.final_v
         self.displacement = s.rows(s.work.displacement.real.shape[1])
+        self.volume = s.rows(s.work.cavity_volume.real.shape[1])
         self.start_gradient = s.rows(s.work.point_gradient.real.shape[1])
         self.start_point = s.rows(s.work.point_gradient.real.shape[1])
 
@@ -69,6 +70,7 @@ class StageAdjoint(StepAdjoint):
         system.measure_rows()
         if self.model.row_count:
             self.displacement.copy_from(w.displacement)
+            self.volume.copy_from(w.cavity_volume)
             self.start_gradient.copy_from(w.point_gradient)
         system.command(h, self.pace)
         if self.leaning is not None:
@@ -105,11 +107,16 @@ class StageAdjoint(StepAdjoint):
         s, m, i, w, g, x = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.index
         assert self.leaning is not None
         if m.row_count:
-            inputs = [m.point_cable, self.start_gradient.real, self.start.real]
-            s.each_real(self.k_stage.start_points, m.point_count, inputs, [self.start_point.real])
+            inputs = [x.point_row, self.start_gradient.real, self.start.real]
+            s.each_real(self.k_stage.start_points, len(m.point_node), inputs, [self.start_point.real])
+            if self.frames is not None:
+                f = self.frames
+                inputs = [m.node_count, f.item_start, f.item, f.model.carried_slot, f.model.carried_offset]
+                inputs += [x.node_point_start, x.node_point, x.node_point_weight, i["pose0"].real]
+                s.each_real(self.k_stage.start_frames, f.model.count, [*inputs, self.start_point.real], [f.start.real])
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
         s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
-        inputs = [self.h, s.lanes, m.point_count, m.node_dof, m.node_body, m.dof_free]
+        inputs = [self.h, s.lanes, m.node_dof, m.node_body, m.dof_free]
         inputs += [x.node_point_start, x.node_point, x.node_point_weight]
         inputs += [i["density"].real, s.felt["beta"].real, w.body_mass.real, self.seed.real, self.leaning.pushed.real]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real, self.start_point.real]

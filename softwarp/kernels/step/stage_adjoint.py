@@ -26,7 +26,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("adjoint.stage")
     one = single.functions(variant)
-    vec3, quat, vector_at, put = one.vec3, one.quat, one.vector_at, one.put
+    vec3, quat, vector_at, quat_at, put, add_to = one.vec3, one.quat, one.vector_at, one.quat_at, one.put, one.add_to
     exponential, logarithm = one.exponential, one.logarithm
     turns, of_rods = of_frames.functions(variant), rod_adjoint.functions(variant)
     turn_bar, jacobian_transposed = turns.turn_bar, turns.jacobian_transposed
@@ -35,23 +35,57 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def start_points(
         # Model
-        point_cable: wp.array(dtype=wp.int32),
+        point_row: wp.array(dtype=wp.int32),
         # Workspace in
         point_gradient_in: wp.array3d(dtype=real),
         start_in: wp.array3d(dtype=real),
         # Workspace out
         point_bar_out: wp.array3d(dtype=real),
     ):
-        """Gradient by one point of a cable where the stage started, by its displacement there."""
+        """Gradient by one point of a row where the stage started, by its displacement there."""
         pack, point, lane = wp.tid()
         here = vector_at(point_gradient_in, pack, lane, 3 * point)
-        put(point_bar_out, pack, lane, 3 * point, start_in[pack, point_cable[point], lane] * here)
+        put(point_bar_out, pack, lane, 3 * point, start_in[pack, point_row[point], lane] * here)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def start_frames(
+        nodes: int,
+        # Model
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        point_bar_in: wp.array3d(dtype=real),
+        # Workspace out
+        start_out: wp.array3d(dtype=real),
+    ):
+        """Add what the points that one frame carries have where the stage started, by its place and turn there."""
+        pack, frame, lane = wp.tid()
+        q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+        place = vec3()
+        turn = vec3()
+        for k in range(frame_item_start[frame], frame_item_start[frame + 1]):
+            item = frame_item[k]
+            node = carried_slot[item]
+            if node < nodes:
+                total = vec3()
+                for i in range(node_point_start[node], node_point_start[node + 1]):
+                    total += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
+                offset = vec3(carried_offset[item, 0], carried_offset[item, 1], carried_offset[item, 2])
+                place += total
+                turn += wp.cross(wp.quat_rotate(q, offset), total)
+        add_to(start_out, pack, lane, 6 * frame, place)
+        add_to(start_out, pack, lane, 6 * frame + 3, turn)
 
     @wp.kernel(module=module, enable_backward=False)
     def nodes(
         h: real,
         lanes: int,
-        cable_points: int,
         # Model
         node_dof: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
@@ -92,8 +126,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 share = h / (h + beta_in[pack, body, lane])  # h^2 / k
                 by_v = h * by_x + seed - pushed + share * (pushed - body_mass_in[pack, body, lane] * mass_p)
             for i in range(node_point_start[node], node_point_start[node + 1]):
-                if node_point[i] < cable_points:
-                    by_x += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
+                by_x += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
             for c in range(3):
                 row = 3 * node + c
                 found = mass_p[c]
@@ -192,6 +225,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         start_points=start_points,
+        start_frames=start_frames,
         nodes=nodes,
         part=part,
         part_frames=part_frames,
