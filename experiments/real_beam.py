@@ -216,7 +216,10 @@ class Case:
         told = self.loads[self.fitted[number]]
         heights, known = (torch.as_tensor(values).to(rest) for values in (list(told["static"].values()), told["peaks"]))
         times, peaks = beam_gradient.lower_peaks(motion, DT)
-        times, peaks = (torch.nn.functional.pad(v[: len(known)], (0, max(len(known) - len(v), 0)), value=torch.nan) for v in (times, peaks))
+        times, peaks = (
+            torch.nn.functional.pad(v[: len(known)], (0, max(len(known) - len(v), 0)), value=torch.nan)
+            for v in (times, peaks)
+        )
         frequency = (len(known) - 1) / (times[-1] - times[0])
         peaks = known[0] / peaks[0] * peaks
         return torch.cat(

@@ -72,7 +72,8 @@ class CarriedWorlds:
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._counts = [each.stop - each.start for each, _ in twins]
         self._p, self._left = (
-            [wp.to_torch(getattr(part, name).real, requires_grad=False) for part in parts] for name in ("p", "imbalance")
+            [wp.to_torch(getattr(part, name).real, requires_grad=False) for part in parts]
+            for name in ("p", "imbalance")
         )
         self._find_unknowns()
         self._last: dict[str, torch.Tensor] | None = None
@@ -248,8 +249,8 @@ class CarriedWorlds:
         if worlds:
             listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
             raise Diverged(
-                f"equilibrium: the gradient of {len(worlds)} worlds ({listed}) is not found by corrections, as near where "
-                "something buckles; take milder commands, or a Rollout with damping that comes to rest"
+                f"equilibrium: the gradient of {len(worlds)} worlds ({listed}) is not found by corrections, as near "
+                "where something buckles; take milder commands, or a Rollout with damping that comes to rest"
             )
 
     def _put(self, rows: torch.Tensor) -> None:

@@ -300,8 +300,8 @@ class FrameWorlds:
             self._factorise(torch.ones(self.model.num_worlds, dtype=torch.bool, device=pose.device))
             self._fresh = token
         assert self._factor is not None
-        by_turn = by_turn(pose[:, self.masters, 3:], by_pose[..., 3:])
-        y = torch.cat([by_pose[..., :3], by_turn], dim=-1).flatten(1).double().masked_fill(self._held, 0.0)
+        turns = by_turn(pose[:, self.masters, 3:], by_pose[..., 3:])
+        y = torch.cat([by_pose[..., :3], turns], dim=-1).flatten(1).double().masked_fill(self._held, 0.0)
         p = -torch.linalg.lu_solve(*self._factor, y[..., None], adjoint=True)[..., 0].masked_fill(self._held, 0.0)
         begin = 0
         for view, count in zip(self._p, self._counts, strict=True):

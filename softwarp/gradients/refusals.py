@@ -7,11 +7,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import Carrier, CavityControl, Target
+from softwarp.model.codes import Carrier, Spin, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
-from softwarp.solvers.options import Options
 
 
 class Diverged(RuntimeError):
@@ -20,11 +19,11 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim))
+    parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _contacts(sim))
     if sim.options.pressure_tangent and sim.model.has_moving_frames:
         told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
         return f"{told}; take pressure_tangent=False"
-    return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator == "bdf2" else ()), None)
+    return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator != "euler" else ()), None)
 
 
 def require_differentiable(sim: Simulation) -> None:
@@ -77,9 +76,11 @@ def _resting_frames(sim: Simulation) -> Iterator[str]:
     yield from _rods(sim)
 
 
-def _options(options: Options) -> Iterator[str]:
-    if options.integrator == "trapezoidal":
-        yield "steps of integrator 'trapezoidal' have no gradient yet; take integrator='bdf2' or 'euler'"
+def _options(sim: Simulation) -> Iterator[str]:
+    options = sim.options
+    if options.integrator == "trapezoidal" and sim.model.row_count == 0 and sim.model.contact is None:
+        told = "steps of integrator 'trapezoidal' have no gradient yet where they are not those of 'bdf2'"
+        yield f"{told}; take integrator='bdf2' or 'euler'"
     if options.newton_iterations > 1:
         count = options.newton_iterations
         yield f"steps of newton_iterations={count} have no gradient yet; take newton_iterations=1 and a shorter dt"
@@ -90,13 +91,19 @@ def _options(options: Options) -> Iterator[str]:
 
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
+    told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
     if sim.model.joints is not None:
-        yield "joints have no gradient with integrator 'bdf2' yet; take integrator='euler'"
-    told = "has no gradient with integrator 'bdf2'; take integrator='euler'"
+        yield f"a joint {told}"
     if sim.model.contact is not None:
-        yield f"contact {told}, which steps that touch something are made of anyway"
+        yield f"contact {told}, which it falls back to beside contact anyway, with a shorter dt"
     if sim.options.pressure_tangent:
         yield f"the tangent of pressures {told}, or pressure_tangent=False"
+    frames = sim.model.frames
+    if frames is not None and sim.model.has_moving_frames:
+        tops = np.flatnonzero(frames.frame_spin.numpy() == int(Spin.FREE_TOP))
+        tops = tops[tops < frames.rigid_count]
+        if tops.size:
+            yield f"rigid body {sim.model.rigid_names[int(tops[0])]!r}, which nothing elastic holds, {told}"
 
 
 SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)
@@ -184,13 +191,3 @@ def _rods(sim: Simulation) -> Iterator[str]:
         yield f"tubes that slide in each other, {name!r} among them, have no gradient yet; take plain rods"
     if not sim.options.project_tangent:
         yield f"rod {name!r} has no gradient with project_tangent=False yet; take project_tangent=True"
-
-
-def _chambers(model: Model) -> Iterator[str]:
-    """Chambers whose pressure is not prescribed."""
-    if model.cavities is not None:
-        control = model.cavities.cavity_control.numpy()
-        others = np.flatnonzero(control != CavityControl.PRESSURE)
-        if others.size:
-            name, kind = model.cavity_names[int(others[0])], CavityControl(int(control[others[0]])).name.lower()
-            yield f"{kind} control of chamber {name!r} has no gradient yet; take control='pressure', or a Rollout"

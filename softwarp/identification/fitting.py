@@ -211,7 +211,7 @@ class _Problem:
         self, residuals: Differentiable, u: FloatArray, centre: FloatArray, tolerance: float, most: int
     ) -> tuple[SimpleNamespace, FloatArray]:
         """Where a descent along gradients stopped and why, told as ``descend`` does, and the residuals there."""
-        space, worst = self.candidates.space, np.zeros(1)
+        worst = np.zeros(1)
         start = np.clip(u, 0.0, 1.0)
         self._last = (start.tobytes(), centre)
 
@@ -289,7 +289,9 @@ class _Problem:
             place[i] += step if u[i] < 0.5 else -step
             J[:, i] = (self.candidates(place[None])[0] - centre) / (place[i] - u[i])
         if not np.isfinite(J).all():
-            raise FloatingPointError("fit: residuals diverge beside the start; narrow the bounds, or make steps smaller")
+            raise FloatingPointError(
+                "fit: residuals diverge beside the start; narrow the bounds, or make steps smaller"
+            )
         return J
 
     def _at(self, u: FloatArray) -> FloatArray:

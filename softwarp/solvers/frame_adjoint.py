@@ -146,7 +146,9 @@ class FrameAdjoint:
             s.each(kernel, second.count, [second.element_node, velocity.S], [w.gauss_corner_v.S])
         for kind in self.attachments.held:
             of_points = kind.velocity is w.gauss_corner_v
-            self.attachments.products.add(kind, w.body_stiffness.S, kind.velocity if of_points else velocity, self.stiff)
+            self.attachments.products.add(
+                kind, w.body_stiffness.S, kind.velocity if of_points else velocity, self.stiff
+            )
 
     def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
         """What carried nodes have goes to their frames; they have no gradients of their own."""
@@ -202,7 +204,7 @@ class FrameAdjoint:
 
     def to_parameters(self, p: Rows) -> None:
         """Add the gradients by parameters and gravity; needs ``to_state``."""
-        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+        s, m, w, g = self.shard, self.model, self.shard.work, self.gradients
         self._to_sources(p)
         self.share.zero()  # of one solution
         for lists, count, first, density, outputs in self.owners:

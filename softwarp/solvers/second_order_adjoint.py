@@ -51,7 +51,7 @@ class StageAdjoint(StepAdjoint):
         assert self.leaning is not None
         self.start_v = self.leaning.start_v
         self.pace, self.predict = pace, predict
-        s, m = self.shard, self.model
+        s = self.shard
         self.k_stage = stage_adjoint.kernels(s.variant)
         self.lapse, self.is_stage = pace.lapse, True
         self.solved_v, self.final_v = s.rows(s.dof_room), s.rows(s.dof_room)
@@ -157,7 +157,8 @@ class SecondOrderAdjoint:
         self.frames = model.frames if (model := system.model).has_moving_frames else None
         if self.frames is None:
             self.arrays = {name: array for name, array in self.arrays.items() if name not in FRAMES}
-        self.middle = {name: memory.zeros(a.shape, a.dtype, device) for name, a in self.arrays.items() if name in FRAMES}
+        frames = {name: array for name, array in self.arrays.items() if name in FRAMES}
+        self.middle = {name: memory.zeros(a.shape, a.dtype, device) for name, a in frames.items()}
 
     def step(self) -> None:
         """Gradients by the end of the step from the system's state become those by its start."""

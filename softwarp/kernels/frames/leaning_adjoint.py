@@ -4,9 +4,9 @@ With k = h (h + beta') elements have in the place of the velocities v
 
     v - s v0 + d e y,    s = h / (h + beta'),  d = 1 - s,
 
-v0 the velocities of the start in a stage that is linearised where these lead to (else s counts as 0), and y the memories
-of Maxwell branches with e = g r / beta'. Rows have v - v0. With kappa = k K p of every node, and r at its lever, a frame
-has s kappa, r x s kappa of what it carries by its own v0, and -d kappa likewise by e y.
+v0 the velocities of the start in a stage that is linearised where these lead to (else 0), and y the memories of Maxwell
+branches with e = g r / beta'. Rows have v - v0. With kappa = k K p of a node at the lever r its frame has s kappa and
+r x s kappa by its own v0, and -d kappa likewise by e y.
 
 The stage moves frames by h V0 and exp [h w0]: a gradient g by the turn there is exp' g by that at the start, and
 h T(h w0)' g by w0. Unknown rotations u come on top of that turn, so w = w0 + T(h w0)^-1 u.
@@ -167,7 +167,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         frame_p_out: wp.array3d(dtype=real),
         early_out: wp.array3d(dtype=real),
     ):
-        """What segments have in the place of the twist of one frame, its adjoint, and v0 + e y, from its master's dofs.
+        """What segments have in the place of the twist of one frame; its adjoint; v0 + e y.
 
         Rods have e y in a stage only, where they damp what they move with already.
         """
@@ -294,7 +294,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         felt_out: wp.array3d(dtype=real),
     ):
-        """Gradients by velocities of the start and of the memory that one welded frame has, from those by velocities."""
+        """Gradients by velocities of the start and of the memory that one welded frame has, from its items."""
         pack, number, lane = wp.tid()
         frame = welded_frame[number]
         item = slot_carried[nodes + 2 * frame]
@@ -427,9 +427,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         memory_out: wp.array3d(dtype=real),
     ):
-        """As ``adjoint.frame_gradients``, and in ``memory`` the gradient by e y, less what e has in masses, of one frame.
+        """As ``adjoint.frame_gradients``, and in ``memory`` the gradient by e y, of one frame.
 
-        ``predicts`` is 1 in a stage, where segments and items act at the pose that the start velocities lead to, else 0;
+        ``predicts`` is 1 in a stage, where segments and items act at the pose that start velocities lead to, else 0;
         forces on a free top act at that of the start. ``start_v_in`` are velocities of dofs in a stage.
         """
         pack, frame, lane = wp.tid()

@@ -150,7 +150,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         had += (
             turning + on + wp.dot(P, vector_at(end_v_in, pack, lane, t)) + wp.dot(L, vector_at(end_v_in, pack, lane, r))
         )
-        pt += wp.cross(vector_at(p_in, pack, lane, r), wp.quat_rotate(quat_at(force_pose_in, pack, lane, 7 * frame + 3), x))
+        pt += wp.cross(
+            vector_at(p_in, pack, lane, r), wp.quat_rotate(quat_at(force_pose_in, pack, lane, 7 * frame + 3), x)
+        )
         value_out[pack, 2 * item, lane] = had + h * weight * wp.dot(pt, vector_at(gravity_in, pack, lane, 0))
         value_out[pack, 2 * item + 1, lane] = has
 

@@ -181,7 +181,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """The same of one frame, which is turned on about the axis of its turn so far; free tops are left out.
 
-        With q1 = exp(phi) q0 the frame is at exp(c phi) q0, and phi changes by T(phi)^-1 of the change of its exponential.
+        With q1 = exp(phi) q0 the frame is at exp(c phi) q0; phi changes by T(phi)^-1 of the turn of its exponential.
         """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane
