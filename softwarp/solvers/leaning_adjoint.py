@@ -235,8 +235,9 @@ class Leaning:
             inputs += [term.lean_share.real, i["frame_memory"].real, final_v.real, self.frames.mind.real]
             s.each_real(k.frame_memories, frames, inputs, [g.frame_memory, self.value.real])
         if parameters:
-            inputs = [self.h, s.lanes, m.body_count, frames, i["relaxation_ratio"].real, i["relaxation_time"].real]
+            inputs = [self.h, s.lanes, m.body_count, frames, self.before]
+            inputs += [i["relaxation_ratio"].real, i["relaxation_time"].real]
             inputs += [w.body_damping.real, beta, term.keep.real, term.lean_share.real]
-            inputs += [self.sums.real, self.value.real, self.before]
+            inputs += [self.sums.real, self.value.real]
             outputs = [g.rayleigh_stiffness, g.relaxation_ratio, g.relaxation_time]
             s.each_real(k.constants, None, inputs, outputs)

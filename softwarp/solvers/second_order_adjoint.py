@@ -10,6 +10,7 @@ import warp as wp
 
 from softwarp.kernels.step import stage_adjoint
 from softwarp.model import memory
+from softwarp.model.frames import FrameModel
 from softwarp.model.gradients import FRAMES, MEMORIES, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
@@ -183,21 +184,21 @@ class SecondOrderAdjoint:
             elif name not in FRAMES:
                 wp.copy(self.kept[name], array)
         if self.frames is not None:
-            self._split_frames(first)
+            self._split_frames(self.frames, first)
         stepper.give_back()
         self._pull(self.pulls[0], first, parameters)
         for name, array in self.arrays.items():
             self._launch(self.k.add, [self.kept[name]], [array])
 
-    def _split_frames(self, first: Stage) -> None:
+    def _split_frames(self, frames: FrameModel, first: Stage) -> None:
         """Gradients by extrapolated frames become those by the end of the first stage and by the start of the step."""
         stepper, s = self.stepper, self.stepper.shard
         starts = [stepper.start[name] for name in FRAMES]
         ends = [self.middle[name] for name in FRAMES]
         bars = [self.arrays[name] for name in FRAMES]
         rests = [self.kept[name] for name in FRAMES]
-        inputs = [first.factor, s.lanes, self.frames.frame_master, self.frames.frame_spin, starts[0], ends[0]]
-        s.each_real(self.k.part_frames, self.frames.count, inputs, [*bars, *rests])
+        inputs = [first.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0]]
+        s.each_real(self.k.part_frames, frames.count, inputs, [*bars, *rests])
 
     def _pull(self, pull: StageAdjoint, stage: Stage, parameters: bool) -> None:
         self.stepper.set_lag(stage)

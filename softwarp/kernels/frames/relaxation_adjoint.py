@@ -289,6 +289,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         bodies: int,
         frames: int,
+        # State
+        damped_before_in: wp.array2d(dtype=real),
         # Workspace in
         ratio_in: wp.array3d(dtype=real),
         time_in: wp.array3d(dtype=real),
@@ -298,8 +300,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lean_in: wp.array3d(dtype=real),
         sum_in: wp.array3d(dtype=real),
         value_in: wp.array3d(dtype=real),
-        # State
-        damped_before_in: wp.array2d(dtype=real),
         # State out
         rayleigh_stiffness_bar_out: wp.array2d(dtype=real),
         ratio_bar_out: wp.array2d(dtype=real),
