@@ -61,12 +61,12 @@ class Equilibrium:
     factorisation, whatever the number of unknowns, and has the exact tangent: its gradients are those of the
     equilibrium, not of the way to it. Further backward passes of the last pose have that factor, too.
 
-    Rods and rigid bodies are brought to rest by Newton's method with the exact tangent, where ``solve_static`` takes
-    steps: first by steps of the simulation, damped as it is, which end in the equilibrium that the motion would.
+    Rods and rigid bodies alone are brought to rest by Newton's method with the exact tangent, where ``solve_static``
+    takes steps: first by steps of the simulation, damped as it is, which end in the equilibrium that the motion would.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers; or rods and rigid bodies, with
-            cables under force control.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers; or rods and rigid bodies, perhaps
+            beside soft bodies without chambers, with cables under force control.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
         warm: Whether a solve starts from the last one's poses, as of fits, whose parameters change little by little; a
             result depends on those before it within the tolerance then.

@@ -84,7 +84,7 @@ def given_of(sim: sw.Simulation, seeds: list[int]) -> Inputs:
 def test_gradients_are_those_of_differences(base: str, integrator: str, options: dict[str, Any]) -> None:
     """By ratio and time of the branch, and all inputs that a carried beam has."""
     sim = beam(base, integrator, **options)
-    given = given_of(sim, [1])
+    given = given_of(sim, [2])
     given["controls"] = {name: value.expand(STEPS, *value.shape) for name, value in given["controls"].items()}
     check(Rollout(sim), given, test_rigid.loss, SIZES)
 
