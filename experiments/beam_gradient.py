@@ -18,6 +18,8 @@ from softwarp.identification import Differentiable
 
 Floats = NDArray[np.float64]
 
+AFTER = 6  # steps
+
 
 class Ring:
     """Markers of the beam at rest, and the one that rings, for one candidate.
@@ -27,14 +29,23 @@ class Ring:
         places: Of markers, from the middle of the end [m], (marker, 3).
         peaks: First lower peaks from rest, one per load, negative [mm].
         which: Marker that rings.
-        steps: Of the ring-down.
+        counts: Lower peaks of every load that are looked at.
+        steps: Of the ring-down, at most: once these peaks have been seen, it ends ``AFTER`` steps behind the last.
         limits: ``side`` of the beam [m], ``gravity`` [m/s^2], ``pull`` [N] and ``higher``, as of ``real_beam``.
     """
 
     def __init__(
-        self, beam: Any, places: Floats, peaks: Floats, which: int, steps: int, limits: dict[str, float]
+        self,
+        beam: Any,
+        places: Floats,
+        peaks: Floats,
+        which: int,
+        counts: list[int],
+        steps: int,
+        limits: dict[str, float],
     ) -> None:
-        self.beam, self.which, self.steps, self.limits = beam, which, steps, limits
+        self.beam, self.which, self.counts, self.limits = beam, which, counts, limits
+        self.most = self.steps = steps
         self.equilibria = [Equilibrium(beam.sim, warm=True) for _ in range(2)]
         self.rollout = Rollout(beam.sim)
         like = beam.sim.node_x
@@ -73,18 +84,29 @@ class Ring:
         turn = pose[..., 3:] / pose[..., 3:].norm(dim=-1, keepdim=True)
         pose = torch.cat([pose[..., :3], turn], dim=-1)
         parameters = {**modulus, "relaxation_ratio": ratio[:, None], "relaxation_time": time[:, None]}
-        moved = self.rollout(
-            {"node_x": x, "body_pose": pose}, {"body_force": wrench(0.0)}, parameters, steps=self.steps
-        )
-        poses = torch.cat([pose[None], moved.body_pose])[:, :, 0]
-        return rest, (self.markers(poses)[..., self.which] - rest[:, self.which]).T
+        start, controls = {"node_x": x, "body_pose": pose}, {"body_force": wrench(0.0)}
+        motion = pose.new_zeros((len(pose), 0))
+        for steps in dict.fromkeys((self.steps, self.most)):
+            moved = self.rollout(start, controls, parameters, steps=steps)
+            poses = torch.cat([pose[None], moved.body_pose])[:, :, 0]
+            motion = (self.markers(poses)[..., self.which] - rest[:, self.which]).T
+            found = [minima(each) for each in motion]
+            if all(len(at) >= count for at, count in zip(found, self.counts, strict=True)):
+                last = max(int(at[count - 1]) for at, count in zip(found, self.counts, strict=True))
+                self.steps = min(last + AFTER, self.most)
+                break
+        return rest, motion
+
+
+def minima(positions: torch.Tensor) -> torch.Tensor:
+    """Samples that are lower than those beside them, (minimum,)."""
+    x = positions.detach()
+    return ((x[1:-1] <= x[:-2]) & (x[1:-1] < x[2:])).nonzero().flatten() + 1
 
 
 def lower_peaks(positions: torch.Tensor, step: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Times [s] and heights of the minima of a motion, by parabolas through three samples, (peak,)."""
-    inner = positions.detach()
-    at = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] < inner[2:])
-    number = at.nonzero().flatten() + 1
+    number = minima(positions)
     below, here, above = positions[number - 1], positions[number], positions[number + 1]
     shift = 0.5 * (below - above) / (below - 2.0 * here + above)
     return (number + shift) * step, here - 0.25 * (below - above) * shift

@@ -207,7 +207,8 @@ class Case:
         steps = round(PERIODS / SLOWEST / DT)
         first = np.array([self.loads[name]["peaks"][0] for name in self.fitted])
         limits = {"side": SIDE, "gravity": GRAVITY, "pull": PULL, "higher": HIGHER}
-        ring = beam_gradient.Ring(self.beam(self.fitted, 1), self.places, first, MARKER, steps, limits)
+        counts = [len(self.loads[name]["peaks"]) for name in self.fitted]
+        ring = beam_gradient.Ring(self.beam(self.fitted, 1), self.places, first, MARKER, counts, steps, limits)
         return fit(PARAMETERS, beam_gradient.residuals(ring, self._differences), **options)
 
     def _differences(self, number: int, found: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
