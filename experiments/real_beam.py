@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.identification import Fit, Parameter, fit
+from softwarp.identification import Differentiable, Fit, Parameter, fit
 from softwarp.io.atomic import atomic_path
 
 from . import beam_gradient
@@ -194,7 +194,7 @@ class Case:
         """Fit the parameters to places at rest, frequencies and successive peaks of all loads at once."""
         options = {"tolerance": 1e-2, "max_iterations": 6, **options}
         if options.get("method") == "gradient":
-            return self._fit_by_gradient(**{**options, "max_iterations": 30})
+            return fit(PARAMETERS, self.differentiable(), **{**options, "max_iterations": 30})
         beam = self.beam(self.fitted, CANDIDATES)
 
         def residuals(values: Floats) -> Floats:
@@ -202,14 +202,14 @@ class Case:
 
         return fit(PARAMETERS, residuals, batch=CANDIDATES, **options)
 
-    def _fit_by_gradient(self, **options: Any) -> Fit:
-        """The same along exact derivatives, one candidate at a time."""
+    def differentiable(self) -> Differentiable:
+        """Residuals of all loads that torch differentiates, of one candidate at a time."""
         steps = round(PERIODS / SLOWEST / DT)
         first = np.array([self.loads[name]["peaks"][0] for name in self.fitted])
         limits = {"side": SIDE, "gravity": GRAVITY, "pull": PULL, "higher": HIGHER}
         counts = [len(self.loads[name]["peaks"]) for name in self.fitted]
         ring = beam_gradient.Ring(self.beam(self.fitted, 1), self.places, first, MARKER, counts, steps, limits)
-        return fit(PARAMETERS, beam_gradient.residuals(ring, self._differences), **options)
+        return beam_gradient.residuals(ring, self._differences)
 
     def _differences(self, number: int, found: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
         """What ``_residuals`` has of one load, as torch differentiates it; nan for peaks that are missing."""
