@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from softwarp.kernels.frames import extrapolated_adjoint
 from softwarp.kernels.step import stage_adjoint
 from softwarp.model import memory
 from softwarp.model.frames import FrameModel
@@ -144,6 +145,7 @@ class SecondOrderAdjoint:
         self.solution: list[wp.array] = []
         system, device = stepper.system, stepper.shard.device
         self.k = stage_adjoint.kernels(system.variant)
+        self.k_frames = extrapolated_adjoint.kernels(system.variant)
 
         def stage(each: Stage) -> StageAdjoint:
             h = each.length * stepper.h
@@ -198,7 +200,7 @@ class SecondOrderAdjoint:
         bars = [self.arrays[name] for name in FRAMES]
         rests = [self.kept[name] for name in FRAMES]
         inputs = [first.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0]]
-        s.each_real(self.k.part_frames, frames.count, inputs, [*bars, *rests])
+        s.each_real(self.k_frames.part_frames, frames.count, inputs, [*bars, *rests])
 
     def _pull(self, pull: StageAdjoint, stage: Stage, parameters: bool) -> None:
         self.stepper.set_lag(stage)
