@@ -46,7 +46,7 @@ class Ring:
     ) -> None:
         self.beam, self.which, self.counts, self.limits = beam, which, counts, limits
         self.most = self.steps = steps
-        self.equilibria = [Equilibrium(beam.sim, warm=True) for _ in range(2)]
+        self.equilibrium = Equilibrium(beam.sim, warm=True)
         self.rollout = Rollout(beam.sim)
         like = beam.sim.node_x
         self.places, self.peaks = torch.as_tensor(places).to(like), torch.as_tensor(peaks).to(like)
@@ -72,10 +72,7 @@ class Ring:
             return torch.stack([none, none, none + pull, torque, none, none], dim=1)[:, None]
 
         modulus = {"youngs": youngs[:, None]}
-        still, high = (
-            equilibrium({"body_force": wrench(pull)}, modulus)
-            for equilibrium, pull in zip(self.equilibria, (0.0, self.limits["pull"]), strict=True)
-        )
+        still, high = (self.equilibrium({"body_force": wrench(pull)}, modulus) for pull in (0.0, self.limits["pull"]))
         rest = self.markers(still.body_pose[:, 0])
         risen = self.markers(high.body_pose[:, 0]) - rest
         share = (-self.limits["higher"] * self.peaks / risen[:, self.which])[:, None, None]
