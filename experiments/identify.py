@@ -6,6 +6,7 @@
     softwarp identify tentacle --devices cuda:0 cuda:1  # candidates divided among GPUs
     softwarp identify segment                           # modulus and winding from three pressures
     softwarp identify segment --method gradient         # the same from exact derivatives
+    softwarp identify beam --method gradient            # two loads at rest and ringing down, along gradients
 
 The table has values with 95 % confidence intervals, and the error of measurements that were held out. How to fit a
 robot of one's own: docs/identification.md.
@@ -28,7 +29,7 @@ CASES = {  # module of this folder with ``identify(extra, **options) -> Fit``
     "segment": "real_segment",
     "tentacle": "real_tentacle",
 }
-WITH_GRADIENT = ("segment", "tentacle")  # cases whose residuals torch differentiates
+WITH_GRADIENT = ("beam", "segment", "tentacle")  # cases whose residuals torch differentiates
 ON_DEVICES = ("tentacle",)  # cases whose ``identify`` takes ``devices``
 
 

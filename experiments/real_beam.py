@@ -16,13 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.identification import Fit, Parameter, fit
+from softwarp.identification import Differentiable, Fit, Parameter, fit
 from softwarp.io.atomic import atomic_path
 
+from . import beam_gradient
 from .real import Outcome, Row, measured
 
 Floats = NDArray[np.float64]
@@ -188,12 +190,44 @@ class Case:
 
     def fit(self, **options: Any) -> Fit:
         """Fit the parameters to places at rest, frequencies and successive peaks of all loads at once."""
+        options = {"tolerance": 1e-2, "max_iterations": 6, **options}
+        if options.get("method") == "gradient":
+            return fit(PARAMETERS, self.differentiable(), **{**options, "max_iterations": 30})
         beam = self.beam(self.fitted, CANDIDATES)
 
         def residuals(values: Floats) -> Floats:
             return np.array([self._residuals(loads) for loads in self.simulate(beam, self.fitted, values)])
 
-        return fit(PARAMETERS, residuals, batch=CANDIDATES, **{"tolerance": 1e-2, "max_iterations": 6, **options})
+        return fit(PARAMETERS, residuals, batch=CANDIDATES, **options)
+
+    def differentiable(self) -> Differentiable:
+        """Residuals of all loads that torch differentiates, of one candidate at a time."""
+        steps = round(PERIODS / SLOWEST / DT)
+        first = np.array([self.loads[name]["peaks"][0] for name in self.fitted])
+        limits = {"side": SIDE, "gravity": GRAVITY, "pull": PULL, "higher": HIGHER}
+        counts = [len(self.loads[name]["peaks"]) for name in self.fitted]
+        ring = beam_gradient.Ring(self.beam(self.fitted, 1), self.places, first, MARKER, counts, steps, limits)
+        return beam_gradient.residuals(ring, self._differences)
+
+    def _differences(self, number: int, found: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        """What ``_residuals`` has of one load, as torch differentiates it; nan for peaks that are missing."""
+        rest, motion = found
+        told = self.loads[self.fitted[number]]
+        heights, known = (torch.as_tensor(values).to(rest) for values in (list(told["static"].values()), told["peaks"]))
+        times, peaks = beam_gradient.lower_peaks(motion, DT)
+        times, peaks = (
+            torch.nn.functional.pad(v[: len(known)], (0, max(len(known) - len(v), 0)), value=torch.nan)
+            for v in (times, peaks)
+        )
+        frequency = (len(known) - 1) / (times[-1] - times[0])
+        peaks = known[0] / peaks[0] * peaks
+        return torch.cat(
+            [
+                (rest - heights) / torch.hypot(STATIC[0] * heights, torch.full_like(heights, STATIC[1])),
+                ((frequency / told["frequency"] - 1.0) / FREQUENCY)[None],
+                ((peaks - known) / torch.hypot(PEAK[0] * known, torch.full_like(known, PEAK[1])))[1:],
+            ]
+        )
 
     def _residuals(self, loads: list[dict[str, Any]]) -> Floats:
         """Squares of differences in units of what they may be, with their signs.

@@ -10,6 +10,7 @@ import torch
 
 from softwarp import checks, interop
 from softwarp.gradients.calls import highest_guard
+from softwarp.gradients.carried_equilibrium import AtRestTogether, CarriedWorlds
 from softwarp.gradients.frame_equilibrium import AtRest, FrameWorlds, after
 from softwarp.gradients.refusals import Diverged, require_static_gradient
 from softwarp.gradients.rest import RestShape
@@ -24,9 +25,8 @@ from softwarp.solvers.static_adjoint import StaticAdjoint
 from softwarp.threads import Workers, alone
 
 Tensors = Mapping[str, torch.Tensor]
-RESTING = tuple(
-    name for name in PARAMETERS if name not in ("rayleigh_mass", "rayleigh_stiffness", "cable_damping", "pair_mu")
-)  # what an equilibrium depends on
+MOVING = ("rayleigh_mass", "rayleigh_stiffness", "relaxation_ratio", "relaxation_time", "cable_damping", "pair_mu")
+RESTING = tuple(name for name in PARAMETERS if name not in MOVING)  # what an equilibrium depends on
 FRAME_COMMANDS = ("body_force", "rod_force", "cable_tension")  # what rods and rigid bodies at rest depend on
 FRAME_PARAMETERS = ("rod_youngs", "rod_nu", "rod_density", "body_mass", "gravity")
 
@@ -61,12 +61,12 @@ class Equilibrium:
     factorisation, whatever the number of unknowns, and has the exact tangent: its gradients are those of the
     equilibrium, not of the way to it. Further backward passes of the last pose have that factor, too.
 
-    Rods and rigid bodies are brought to rest by Newton's method with the exact tangent, where ``solve_static`` takes
-    steps: first by steps of the simulation, damped as it is, which end in the equilibrium that the motion would.
+    Rods and rigid bodies alone are brought to rest by Newton's method with the exact tangent, where ``solve_static``
+    takes steps: first by steps of the simulation, damped as it is, which end in the equilibrium that the motion would.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers; or rods and rigid bodies, with
-            cables under force control.
+        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers; or rods and rigid bodies, perhaps
+            beside soft bodies without chambers, with cables under force control.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
         warm: Whether a solve starts from the last one's poses, as of fits, whose parameters change little by little; a
             result depends on those before it within the tolerance then.
@@ -84,12 +84,15 @@ class Equilibrium:
         self.warm = checks.flag(warm, "gradients.Equilibrium: warm")
         require_static_gradient(sim)
         model = sim.model
-        self.sim, self.frames, self.shape = sim, None, None
+        self.sim, self.frames, self.carried, self.shape = sim, None, None, None
         self._markers, self._guard = Markers(model, sim.node_x), highest_guard(model)
         if model.has_moving_frames:
             if rest:
                 raise ValueError("gradients.Equilibrium: rods and rigid bodies have no rest shape; leave rest=True out")
-            self.frames = FrameWorlds(sim)
+            if model.body_count:
+                self.carried = CarriedWorlds(sim)
+            else:
+                self.frames = FrameWorlds(sim)
             return
         arrays = create(Gradients, model)
         self.gradients = interop.views(arrays, model)
@@ -147,25 +150,30 @@ class Equilibrium:
             for name, value in tensors_of(said, held).items():
                 given[f"{group}.{name}"] = fitted(said, name, value, names, views)
         limits = {"tolerance": tolerance, "max_iterations": max_iterations}
-        if self.frames is not None:
-            return self._of_frames(self.frames, given, limits)
+        if self.carried is not None or self.frames is not None:
+            return self._of_frames(given, limits)
         x, tension, pressure = _Rest.apply(self, tuple(given), limits, *given.values())
         none = x.new_zeros((len(x), 0, 7))
         return Pose(x, tension, pressure, self._markers(x), none[..., :3], none[..., 3:], none)
 
-    def _of_frames(self, worlds: FrameWorlds, given: dict[str, torch.Tensor], limits: dict[str, Any]) -> Pose:
+    def _of_frames(self, given: dict[str, torch.Tensor], limits: dict[str, Any]) -> Pose:
         """Rods and rigid bodies at rest, with what moves with others."""
         if limits["tolerance"] is not None:
             checks.number(limits["tolerance"], "equilibrium: tolerance", above=0.0)
         checks.count(limits["max_iterations"], "equilibrium: max_iterations")
-        masters = AtRest.apply(self, tuple(given), limits, *given.values())
-        pose = after(worlds, masters)
+        if self.carried is not None:
+            worlds: CarriedWorlds | FrameWorlds = self.carried
+            x, pose = AtRestTogether.apply(self, tuple(given), limits, *given.values())
+        else:
+            assert self.frames is not None
+            worlds = self.frames
+            pose = after(worlds, AtRest.apply(self, tuple(given), limits, *given.values()))
+            x = worlds.state["node_x"].clone()
         tension = given.get("control.cable_tension", worlds.control["cable_tension"].clone())
         least, most = (worlds.parameters[f"cable_{name}_tension"].clone() for name in ("min", "max"))
         tension = tension.clamp(least.clamp(min=0.0), most)
         model = worlds.model
         rods = pose[:, model.rigid_count : model.rigid_count + model.rod_node_count]
-        x = worlds.state["node_x"].clone()
         none = x.new_zeros((len(x), 0))
         return Pose(
             x, tension, none, self._markers(x, pose), rods[..., :3], rods[..., 3:], pose[:, : model.rigid_count]
@@ -173,13 +181,17 @@ class Equilibrium:
 
     def _commands(self) -> tuple[tuple[str, ...], Tensors]:
         """Names of commands, and what each must look like."""
-        if self.frames is None:
-            return COMMANDS, self.sim.control.tensors()
-        return FRAME_COMMANDS, self.frames.control
+        if self.carried is not None:
+            return ("node_force", "traction", *FRAME_COMMANDS), self.carried.control
+        if self.frames is not None:
+            return FRAME_COMMANDS, self.frames.control
+        return COMMANDS, self.sim.control.tensors()
 
     def _parameters(self) -> tuple[tuple[str, ...], Tensors]:
         """Names of parameters, and what each must look like."""
         views = self.sim.params.tensors()
+        if self.carried is not None:
+            return ("youngs", "nu", "density", "law_parameter", *FRAME_PARAMETERS), views
         if self.frames is not None:
             return FRAME_PARAMETERS, views
         if self.shape is None:

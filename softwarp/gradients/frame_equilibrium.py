@@ -244,7 +244,7 @@ class FrameWorlds:
                 self._multiply()
                 bars.append(self.gradients["frame_pose"].index_select(1, self.masters))
         found = torch.stack(bars).double() / self.h
-        turns = _by_turn(self.state["frame_pose"][:, self.masters, 3:].double(), found[..., 3:])
+        turns = by_turn(self.state["frame_pose"][:, self.masters, 3:].double(), found[..., 3:])
         found = torch.cat([found[..., :3], turns], dim=-1).reshape(-1, 6, worlds, count, 6)
         for (_, forces, places), held in zip(self._groups, found, strict=True):
             R[:, forces, :, places] = held[:, :, places].permute(2, 1, 0, 3)
@@ -300,8 +300,8 @@ class FrameWorlds:
             self._factorise(torch.ones(self.model.num_worlds, dtype=torch.bool, device=pose.device))
             self._fresh = token
         assert self._factor is not None
-        by_turn = _by_turn(pose[:, self.masters, 3:], by_pose[..., 3:])
-        y = torch.cat([by_pose[..., :3], by_turn], dim=-1).flatten(1).double().masked_fill(self._held, 0.0)
+        turns = by_turn(pose[:, self.masters, 3:], by_pose[..., 3:])
+        y = torch.cat([by_pose[..., :3], turns], dim=-1).flatten(1).double().masked_fill(self._held, 0.0)
         p = -torch.linalg.lu_solve(*self._factor, y[..., None], adjoint=True)[..., 0].masked_fill(self._held, 0.0)
         begin = 0
         for view, count in zip(self._p, self._counts, strict=True):
@@ -323,7 +323,7 @@ def _by_world(rows: torch.Tensor) -> torch.Tensor:
     return rows.permute(0, 2, 1).reshape(-1, rows.shape[1])
 
 
-def _by_turn(q: torch.Tensor, by_q: torch.Tensor) -> torch.Tensor:
+def by_turn(q: torch.Tensor, by_q: torch.Tensor) -> torch.Tensor:
     """Gradients by turns from those by quaternions."""
     u, by_u = torch.broadcast_tensors(q[..., :3], by_q[..., :3])
     found: torch.Tensor = 0.5 * (q[..., 3:] * by_u + torch.linalg.cross(u, by_u) - by_q[..., 3:] * u)

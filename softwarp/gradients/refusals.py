@@ -7,11 +7,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import Carrier, CavityControl, Target
+from softwarp.model.codes import Carrier, Spin, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
-from softwarp.solvers.options import Options
 
 
 class Diverged(RuntimeError):
@@ -20,11 +19,11 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    parts = itertools.chain(_options(sim.options), _parts(sim.model), _rods(sim), _contacts(sim))
+    parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _contacts(sim))
     if sim.options.pressure_tangent and sim.model.has_moving_frames:
         told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
         return f"{told}; take pressure_tangent=False"
-    return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator == "bdf2" else ()), None)
+    return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator != "euler" else ()), None)
 
 
 def require_differentiable(sim: Simulation) -> None:
@@ -66,8 +65,8 @@ def require_static_gradient(sim: Simulation) -> None:
 def _resting_frames(sim: Simulation) -> Iterator[str]:
     """What equilibria of rods and rigid bodies have no gradient with."""
     model, told = sim.model, "equilibria of rods, and of rigid bodies that move or carry something, have no gradient"
-    if model.body_count:
-        yield f"{told} beside soft bodies yet"
+    if model.cavity_count:
+        yield f"{told} beside chambers yet"
     if model.joints is not None:
         yield f"{told} beside joints yet"
     if model.has_kinematic:
@@ -77,9 +76,11 @@ def _resting_frames(sim: Simulation) -> Iterator[str]:
     yield from _rods(sim)
 
 
-def _options(options: Options) -> Iterator[str]:
-    if options.integrator == "trapezoidal":
-        yield "steps of integrator 'trapezoidal' have no gradient yet; take integrator='bdf2' or 'euler'"
+def _options(sim: Simulation) -> Iterator[str]:
+    options = sim.options
+    if options.integrator == "trapezoidal" and sim.model.row_count == 0 and sim.model.contact is None:
+        told = "steps of integrator 'trapezoidal' have no gradient yet where they are not those of 'bdf2'"
+        yield f"{told}; take integrator='bdf2' or 'euler'"
     if options.newton_iterations > 1:
         count = options.newton_iterations
         yield f"steps of newton_iterations={count} have no gradient yet; take newton_iterations=1 and a shorter dt"
@@ -90,18 +91,19 @@ def _options(options: Options) -> Iterator[str]:
 
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
-    if sim.model.has_moving_frames:
-        told = "rods, and rigid bodies that move or carry something, have no gradient with integrator 'bdf2' yet"
-        yield f"{told}; take integrator='euler'"
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
+    if sim.model.joints is not None:
+        yield f"a joint {told}"
     if sim.model.contact is not None:
-        yield f"contact {told}"
-    if sim.model.cable_elastic.any():
-        yield f"a cable that stretches {told}"
+        yield f"contact {told}, which it falls back to beside contact anyway, with a shorter dt"
     if sim.options.pressure_tangent:
-        yield f"the tangent of pressures {told}"
-    for found in _chambers(sim.model):
-        yield found.replace("has no gradient yet", "has no gradient with integrator 'bdf2' yet")
+        yield f"the tangent of pressures {told}, or pressure_tangent=False"
+    frames = sim.model.frames
+    if frames is not None and sim.model.has_moving_frames:
+        tops = np.flatnonzero(frames.frame_spin.numpy() == int(Spin.FREE_TOP))
+        tops = tops[tops < frames.rigid_count]
+        if tops.size:
+            yield f"rigid body {sim.model.rigid_names[int(tops[0])]!r}, which nothing elastic holds, {told}"
 
 
 SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)
@@ -144,9 +146,11 @@ def _parts(model: Model) -> Iterator[str]:
         yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
     if model.reduction is not None:
         yield "reduced bodies have no gradient yet; take the full mesh"
-    if model.relaxes:
+    if model.relaxes and (model.joints is not None or model.contact is not None):
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
-        yield f"the relaxation of body {model.body_names[body]!r} has no gradient yet; leave its Maxwell branch out"
+        other = "joints" if model.joints is not None else "contact"
+        told = f"the relaxation of body {model.body_names[body]!r} beside {other} has no gradient yet"
+        yield f"{told}; leave its Maxwell branch out"
 
 
 def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
@@ -156,8 +160,6 @@ def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
         names += [f"node {node} of rod {rod!r}" for node in range(count)]
     if frames.blend_frame.size:
         yield "a rod that contact cuts into pieces has no gradient yet; leave contact_pieces out"
-    if model.quadratic is not None and (frames.node_frame.numpy()[: model.body_node_count] >= 0).any():
-        yield "quadratic tetrahedra that rigid bodies or rods carry have no gradient yet; take linear ones"
     if model.contact is not None:
         yield from _carriers_of_touching(model, frames, names)
 
@@ -189,13 +191,3 @@ def _rods(sim: Simulation) -> Iterator[str]:
         yield f"tubes that slide in each other, {name!r} among them, have no gradient yet; take plain rods"
     if not sim.options.project_tangent:
         yield f"rod {name!r} has no gradient with project_tangent=False yet; take project_tangent=True"
-
-
-def _chambers(model: Model) -> Iterator[str]:
-    """Chambers whose pressure is not prescribed."""
-    if model.cavities is not None:
-        control = model.cavities.cavity_control.numpy()
-        others = np.flatnonzero(control != CavityControl.PRESSURE)
-        if others.size:
-            name, kind = model.cavity_names[int(others[0])], CavityControl(int(control[others[0]])).name.lower()
-            yield f"{kind} control of chamber {name!r} has no gradient yet; take control='pressure', or a Rollout"

@@ -68,7 +68,7 @@ class Rollout:
 
     Args:
         sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, rigid bodies, and joints;
-            backward Euler or, of soft bodies alone, BDF2, with one linearisation per step. Its ``dt`` and
+            backward Euler or, without joints and contact, BDF2, with one linearisation per step. Its ``dt`` and
             options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
@@ -124,8 +124,9 @@ class Rollout:
                 ``cable_displacement`` [m], ``cable_tension`` [N], ``cavity_pressure`` [Pa], ``cavity_volume`` and
                 ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
-                ``law_parameter``, ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of
-                contact, ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
+                ``law_parameter``, ``relaxation_ratio`` and ``relaxation_time`` of Maxwell branches,
+                ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of contact,
+                ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
                 ``rod_rayleigh_stiffness``, ``body_mass`` and ``body_damping``, ``joint_stiffness`` and
                 ``joint_damping`` of servos, shaped as in ``sim.params`` or so that
                 they broadcast to that. With ``rest`` also ``rest_x`` [m], the rest positions of the model, (node, 3).
@@ -197,7 +198,7 @@ class Rollout:
         step = torch.arange(plan.every, plan.steps + 1, plan.every)
         x, v, tension, pressure = kept[: len(STATE)]
         model, frames = self.worlds.model, dict(zip(FRAMES, kept[len(STATE) :], strict=False))
-        if not frames:
+        if not model.has_moving_frames:
             frames = {name: x.new_empty((*x.shape[:-2], 0, width)) for name, width in zip(FRAMES, (7, 6), strict=True)}
         rods = slice(model.rigid_count, model.rigid_count + model.rod_node_count)
         pose, twist = (frames[name][..., rods, :] for name in FRAMES)

@@ -10,7 +10,7 @@ import warp as wp
 from softwarp import interop
 from softwarp.gradients.rows import RowDirections
 from softwarp.model.codes import Status
-from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, STATE, Gradients
+from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, MEMORIES, STATE, Gradients
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
@@ -155,6 +155,8 @@ class DifferentiableWorlds:
         memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         if model.joints is not None:
             self.names, memory = (*self.names, *JOINTS), (*memory, *JOINT_MEMORY)
+        if model.relaxes:
+            self.names = (*self.names, *MEMORIES)
         self.memory = tuple(name for name in memory if name not in self.names)
         if model.frames is not None:
             self.state |= interop.frame_aliases(self.state, model, *FRAMES)
@@ -231,7 +233,9 @@ class DifferentiableWorlds:
     @property
     def directions(self) -> Directions | RowDirections:
         """What pushes slopes through steps, made when it is first asked for."""
-        if self._directions is None and (self.model.has_moving_frames or self.sim.options.integrator != "euler"):
+        if self._directions is None and (
+            self.model.has_moving_frames or self.model.relaxes or self.sim.options.integrator != "euler"
+        ):
             self._directions = RowDirections(self)
         elif self._directions is None:
             self._directions = Directions(self._twins, self.model, self.h, self._index, self._workers)

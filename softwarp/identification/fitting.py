@@ -119,9 +119,9 @@ def fit(
             "to look for a start within the bounds"
         )
     if method == "gradient" and differentiable is not None:
-        end, centre = problem.slide(differentiable, u, tolerance, max_iterations)
         if candidates.measurements > 2 * len(space) * differentiable.experiments:
             candidates.jacobian = None  # differences cost less than a backward pass for every measurement
+        end, centre = problem.slide(differentiable, u, centre, tolerance, max_iterations)
     else:
         end, centre = problem.descend(u, centre, tolerance, max_iterations)
     derivative = problem.derivative(end.x)
@@ -168,6 +168,7 @@ class _Problem:
         self.weight = np.ones(int(used.sum())) if deviation is None else 1.0 / deviation[used]
         self._known: tuple[bytes, FloatArray, FloatArray] | None = None  # place, those around it, their residuals
         self._last: tuple[bytes, FloatArray] | None = None
+        self._slope: tuple[bytes, FloatArray] | None = None  # place, and derivatives that are known there
 
     def require_freedom(self) -> None:
         """Refuse more parameters than measurements."""
@@ -207,31 +208,91 @@ class _Problem:
         return found, self._last[1]
 
     def slide(
-        self, residuals: Differentiable, u: FloatArray, tolerance: float, most: int
+        self, residuals: Differentiable, u: FloatArray, centre: FloatArray, tolerance: float, most: int
     ) -> tuple[SimpleNamespace, FloatArray]:
         """Where a descent along gradients stopped and why, told as ``descend`` does, and the residuals there."""
-        space, worst = self.candidates.space, np.zeros(1)
+        worst = np.zeros(1)
+        start = np.clip(u, 0.0, 1.0)
+        self._last = (start.tobytes(), centre)
 
         def cost(place: FloatArray) -> tuple[float, FloatArray]:
             r = self._at(place)
             if not np.isfinite(r).all():
                 return 10.0 * float(worst[0]), np.zeros(len(place))  # diverged: the line search comes back
             worst[0] = max(float(worst[0]), 0.5 * float(r @ r))
-            assert self._last is not None
-            by = np.zeros(len(self._last[1]))
-            by[self.used] = self.weight * r
-            values = space.values(place)
-            return 0.5 * float(r @ r), residuals.pull(values, by) * space.slopes(values)
+            return 0.5 * float(r @ r), self._gradient(residuals, place, r)
 
+        if self.candidates.jacobian is None:
+            return self._slide_in_metric(residuals, start, tolerance, most)
         options = {"maxiter": most, "ftol": tolerance, "gtol": 1e-12}
-        found = minimize(
-            cost, np.clip(u, 0.0, 1.0), jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(u), options=options
-        )
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(u), options=options)
         self._at(found.x)
         assert self._last is not None
         is_at_bound = (found.x <= 0.0) | (found.x >= 1.0)
         end = SimpleNamespace(x=found.x, status=2 if found.success else 0, active_mask=is_at_bound.astype(int))
         return end, self._last[1]
+
+    def _gradient(self, residuals: Differentiable, place: FloatArray, r: FloatArray) -> FloatArray:
+        """Gradient of half the sum of squares at the place that was evaluated last, where these are the residuals."""
+        assert self._last is not None
+        by = np.zeros(len(self._last[1]))
+        by[self.used] = self.weight * r
+        values = self.candidates.space.values(place)
+        return np.asarray(residuals.pull(values, by) * self.candidates.space.slopes(values))
+
+    def _slide_in_metric(
+        self, residuals: Differentiable, u: FloatArray, tolerance: float, most: int
+    ) -> tuple[SimpleNamespace, FloatArray]:
+        """The same of few parameters and many measurements, in the metric J'J (Gauss) of differences at the start.
+
+        The first step has the gradient J'r, all others the exact one; J follows the residuals by Broyden's updates
+        (1965), and intervals are found from it. The search ends where a step along the exact gradient promises less
+        than ``tolerance`` of the cost.
+        """
+        assert self._last is not None
+        r, centre = self._at(u), self._last[1]
+        J = self._slopes(u, centre)
+        status = 0
+        for number in range(most + 1):
+            weighted = J[self.used] * self.weight[:, None]
+            g = self._gradient(residuals, u, r) if number else weighted.T @ r
+            free = ~(((u <= 0.0) & (g > 0.0)) | ((u >= 1.0) & (g < 0.0)))
+            step = np.zeros(len(u))
+            step[free] = -np.linalg.lstsq(weighted[:, free].T @ weighted[:, free], g[free], rcond=None)[0]
+            half = 0.5 * float(r @ r)
+            if number and -0.5 * float(g @ step) <= tolerance * half:
+                status = 2
+                break
+            if number == most:
+                break
+            for share in 0.5 ** np.arange(12):
+                place = np.clip(u + share * step, 0.0, 1.0)
+                after = self._at(place)
+                if np.isfinite(after).all() and float(after @ after) < 2.0 * half:
+                    break
+            else:
+                status = 3 if number else 0
+                break
+            way, full = place - u, self._last[1]
+            J = J + np.outer(full - centre - J @ way, way) / float(way @ way)
+            u, r, centre = place, after, full
+        self._last = (u.tobytes(), centre)
+        self._slope = (u.tobytes(), J)
+        is_at_bound = (u <= 0.0) | (u >= 1.0)
+        return SimpleNamespace(x=u, status=status, active_mask=is_at_bound.astype(int)), centre
+
+    def _slopes(self, u: FloatArray, centre: FloatArray) -> FloatArray:
+        """Derivatives of all residuals by places, from one difference each, towards the middle of the bounds."""
+        J = np.zeros((len(centre), len(u)))
+        for i, step in enumerate(self.candidates.space.steps()):
+            place = u.copy()
+            place[i] += step if u[i] < 0.5 else -step
+            J[:, i] = (self.candidates(place[None])[0] - centre) / (place[i] - u[i])
+        if not np.isfinite(J).all():
+            raise FloatingPointError(
+                "fit: residuals diverge beside the start; narrow the bounds, or make steps smaller"
+            )
+        return J
 
     def _at(self, u: FloatArray) -> FloatArray:
         """Residuals at a place; with room in the batch the differences around it are evaluated with it."""
@@ -249,6 +310,8 @@ class _Problem:
 
     def derivative(self, u: FloatArray) -> FloatArray:
         """Derivatives of all residuals by places, shape (measurement, parameter), from what is known where it is."""
+        if self._slope is not None and self._slope[0] == u.tobytes():
+            return self._slope[1]
         self._at(u)
         assert self._last is not None
         if self._known is not None and self._known[0] == u.tobytes():

@@ -21,6 +21,8 @@ class Gradients:
     node_v: wp.array = batched("node", width=3, unit="m/s", doc="by velocity")
     frame_pose: wp.array = batched("frame", width=7, unit="m", doc="by position and quaternion, along which it turns")
     frame_twist: wp.array = batched("frame", width=6, unit="m/s", doc="by velocity and spin [rad/s]")
+    node_memory: wp.array = batched("relaxing node", width=3, unit="m", doc="by what stretches Maxwell branches")
+    frame_memory: wp.array = batched("relaxing frame", width=6, unit="m", doc="likewise, and of turning [rad]")
     joint_reference: wp.array = batched("joint", unit="m", doc="by the position [rad] that a servo steers to")
     cable_tension: wp.array = batched("cable", unit="N", doc="by the tension that a step has found")
     cavity_pressure: wp.array = batched("cavity", unit="Pa", doc="by the pressure that a step has found")
@@ -42,6 +44,8 @@ class Gradients:
     density: wp.array = batched("body", unit="kg/m^3", doc="by density")
     rayleigh_mass: wp.array = batched("body", unit="1/s", doc="by the Rayleigh factor of the mass matrix")
     rayleigh_stiffness: wp.array = batched("body", unit="s", doc="by the Rayleigh factor of the stiffness matrix")
+    relaxation_ratio: wp.array = batched("relaxing body", doc="by the stiffness of the Maxwell branch per the law's")
+    relaxation_time: wp.array = batched("relaxing body", unit="s", doc="by the time in which its force decays")
     gravity: wp.array = batched("world", width=3, unit="m/s^2", doc="by gravity")
     law_parameter: wp.array = batched("law parameter", unit="Pa", doc="by a law's own parameters [exponents: 1]")
     cable_stiffness: wp.array = batched("elastic cable", unit="N/m", doc="by the stiffness of a cable that stretches")
@@ -63,6 +67,7 @@ class Gradients:
 
 STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
 FRAMES = ("frame_pose", "frame_twist")  # of the state too, where there are rods
+MEMORIES = ("node_memory", "frame_memory")  # where there are Maxwell branches
 JOINTS = ("joint_reference",)  # where there are joints
 JOINT_MEMORY = ("joint_position", "joint_multiplier")  # how many turns they have made, and where a search starts
 REST = ("rest_x", "cable_rest_length")
@@ -75,6 +80,7 @@ COMMANDS = (  # after ``command_``
 )
 PARAMETERS = (
     *("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter"),
+    *("relaxation_ratio", "relaxation_time"),
     *("cable_stiffness", "cable_damping", "pair_mu"),
     *("body_mass", "body_damping", "joint_stiffness", "joint_damping"),
     *("rod_youngs", "rod_nu", "rod_density", "rod_rayleigh_mass", "rod_rayleigh_stiffness"),

@@ -18,6 +18,7 @@ from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint, contact_solution
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
+from softwarp.solvers.leaning_adjoint import Leaning, LeaningFrames
 from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.quadratic import QuadraticTerm
@@ -50,7 +51,12 @@ class StepAdjoint:
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
         rest: Whether gradients by the rest shape are asked for.
+
+    Attributes:
+        predicts: Whether it is linearised where its start velocities lead to.
     """
+
+    predicts = False
 
     def __init__(
         self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
@@ -64,6 +70,7 @@ class StepAdjoint:
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_count)
         self.node_v, self.node_p, self.node_mass_p = (s.rows(3 * m.node_count) for _ in range(3))
         self.node_bar = s.rows(3 * m.node_count)
+        self.element_v = self.row_v = self.node_v
         self.corner = s.rows(s.work.element_force.real.shape[1])
         self.tets = self.quadratic = None
         for term in system.terms:
@@ -81,15 +88,24 @@ class StepAdjoint:
             self.surface = SurfaceAdjoint(s, m.cavities, h)
         self.margin, self.lapse, self.rate_lapse, self.is_stage = 0.0, h, h, False
         self.start = s.rows(rows)
-        self.displacement = s.work.displacement  # that commands are measured at
-        self.element_v = self.row_v = self.node_v
+        self.stretches = wp.array(m.cable_elastic, dtype=wp.int32, device=s.device)
+        self.displacement, self.volume = s.work.displacement, s.work.cavity_volume  # that commands are measured at
+        self.final_v = s.work.dof_v
         self.stiffness = s.work.body_stiffness
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
         self.rest = s.rows(12 * m.tet_count) if rest else None
-        self.frames = None
+        self.frames: FrameAdjoint | None = None
+        self.leaning: Leaning | None = None
+        felt: LeaningFrames | None = None
+        leans = self.predicts or m.relaxes
         if m.frames is not None and m.has_moving_frames:
-            self.frames = FrameAdjoint(system, m.frames, h, gradients)
+            if leans:
+                felt = LeaningFrames(system, m.frames, h, gradients, predicts=self.predicts)
+            self.frames = felt or FrameAdjoint(system, m.frames, h, gradients)
+        if leans:
+            self.leaning = leaning = Leaning(system, h, gradients, index, felt)
+            self.element_v, self.row_v = leaning.element_v, leaning.row_v
         self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
@@ -117,7 +133,21 @@ class StepAdjoint:
         lifts = self.frames is not None and self.frames.lifts
         self._load(() if lifts else without)
         if lifts:
-            self.system.forces()
+            self._stiffen()
+
+    def _stiffen(self) -> None:
+        """Forces of elements, and stiffness where it is stored, that carried nodes need."""
+        self._find_forces()
+        for term in self.system.terms:
+            if isinstance(term, TetTerm):
+                term.tets.stiffness()
+            elif isinstance(term, QuadraticTerm):
+                term.points.stiffness()
+
+    def _find_forces(self) -> None:
+        self.system.forces()
+        if isinstance(self.frames, LeaningFrames):
+            self.frames.note_forces()
 
     def _load(self, without: tuple[str, ...] = ()) -> None:
         """What a step starts from."""
@@ -126,6 +156,8 @@ class StepAdjoint:
         system.scale(self.h)
         system.measure_rows()
         system.command(self.h)
+        if self.leaning is not None:
+            self.leaning.load()
 
     def prepare_alone(self) -> None:
         """``prepare`` for ``pull_alone``; a kept solution has what else velocities and node forces are good for."""
@@ -136,7 +168,7 @@ class StepAdjoint:
         system, h = self.system, self.h
         self._load()
         system.find_contacts(h, moving=False)
-        system.forces()
+        self._find_forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=False)
         system.solve(h, h)
@@ -169,9 +201,13 @@ class StepAdjoint:
             self.frames.of_carried(self.index, self.p, self.q, self.node_bar)
             self.frames.to_state(self.p)
         if parameters:
+            if self.leaning is not None:
+                self.leaning.note()
             self._to_parameters()
             if self.frames is not None:
                 self.frames.to_parameters(self.p)
+        if self.leaning is not None:
+            self.leaning.finish(self.node_v, self.node_mass_p, self.p, self.final_v, parameters=parameters)
         if self.contact is not None:
             self.contact.to_state(self.p)
 
@@ -194,6 +230,8 @@ class StepAdjoint:
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
         if self.frames is not None:
             self.frames.seed(self.seed, self.system.linear.y, carries=first)
+        if self.leaning is not None:
+            self.leaning.seed(self.seed, self.system.linear.y)
         self.p.zero()
         self.q.zero()
         if self.contact is not None:
@@ -306,7 +344,7 @@ class StepAdjoint:
         """The same from q and the gradients by bounds."""
         s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
         limits = ("min_displacement", "max_displacement", "min_tension", "max_tension", "max_rate")
-        inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
+        inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control, self.stretches]
         inputs += [i["command_cable_displacement"].real, i["command_cable_tension"].real]
         inputs += [*(i[f"cable_{name}"].real for name in limits), self.displacement.real, w.lag.real]
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real, self.q.real, self.bound.real]
@@ -314,24 +352,27 @@ class StepAdjoint:
         outputs += [self.measured.real, self.start.real]
         s.each_real(self.k_rows.cable_command, m.cable_count, inputs, outputs)
         if m.cable_elastic.any():
-            inputs = [self.lapse, s.lanes, m.cable_force_control, i["cable_stiffness"].real, i["cable_damping"].real]
-            inputs += [w.compliance.real, w.target.real, w.displacement.real, w.multiplier.real, self.q.real]
-            outputs = [g.command_cable_displacement, g.cable_stiffness, g.cable_damping, self.measured.real]
+            inputs = [self.rate_lapse, s.lanes, self.is_stage, m.cable_force_control]
+            inputs += [i["cable_stiffness"].real, i["cable_damping"].real]
+            inputs += [w.compliance.real, w.target.real, self.displacement.real, w.multiplier.real, self.q.real]
+            outputs = [g.command_cable_displacement, g.cable_stiffness, g.cable_damping]
+            outputs += [self.measured.real, self.start.real]
             s.each_real(self.k_rows.cable_stretch, m.cable_count, inputs, outputs)
         if m.cavities is not None:
             self._to_chambers(m.cavities)
 
     def _to_chambers(self, c: CavityModel) -> None:
         s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
-        inputs = [self.h, self.lapse, s.lanes, m.first_row("cavity")]
+        inputs = [self.h, self.lapse, s.lanes, m.first_row("cavity"), self.is_stage]
         inputs += [c.cavity_control, c.cavity_area, c.cavity_rest_volume]
         inputs += [i[f"command_cavity_{name}"].real for name in ("pressure", "volume", "gas")]
         inputs += [i[f"cavity_{name}"].real for name in ("min_pressure", "max_pressure", "min_volume", "max_volume")]
         inputs += [i[f"cavity_{name}"].real for name in ("max_pressure_rate", "max_flow", "ambient", "exponent")]
-        inputs += [i["pressure"].real, w.cavity_volume.real, w.cavity_goal.real, w.lag.real]
+        inputs += [i["pressure"].real, self.volume.real, w.cavity_volume.real, w.cavity_goal.real, w.lag.real]
         inputs += [w.multiplier.real, self.q.real, self.bound.real]
         outputs = [g.command_cavity_pressure, g.command_cavity_volume, g.command_cavity_gas, g.cavity_pressure]
-        s.each_real(self.k_chambers.cavity_command, m.cavity_count, inputs, [*outputs, self.measured.real])
+        outputs += [self.measured.real, self.start.real]
+        s.each_real(self.k_chambers.cavity_command, m.cavity_count, inputs, outputs)
 
     def _to_elements(self, *, parameters: bool = True) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
@@ -339,7 +380,11 @@ class StepAdjoint:
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
         if self.frames is not None:
             self.frames.carry(self.p, self.node_v, self.node_p)
-        self._velocities()
+        if self.leaning is not None:
+            self.leaning.velocities(self.node_v)
+            self.leaning.push(self.seed, self.q)
+        if self.frames is not None:
+            self.frames.lift(self.element_v, self.node_p)
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
         if self.tets is not None:
             self.tets.pull(*elements, parameters=parameters)
@@ -355,9 +400,6 @@ class StepAdjoint:
         s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.point.real])
         if m.cavities is not None:
             self._to_surfaces(m.cavities, fields)
-
-    def _velocities(self) -> None:
-        """What elements and rows have in the place of the velocities of nodes, where that is something else."""
 
     def _to_surfaces(self, c: CavityModel, fields: list[wp.array]) -> None:
         """Gradients by the points of chambers."""

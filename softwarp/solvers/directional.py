@@ -74,7 +74,6 @@ class StepDirection(StepAdjoint):
         s, m, w = self.shard, self.model, self.shard.work
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
-        self._velocities()
         if not m.row_count:
             return
         self.find_activity()

@@ -33,6 +33,9 @@ class FrameAdjoint:
         lifts: Whether frames carry nodes of soft bodies, whose forces at the start of the step count.
         inertial_v: Velocities of dofs that inertia resists, where joints make these others than those that move things.
         end_v: Velocities that frames move on with after the step, likewise.
+        pose, force_pose: Poses at which what they carry moves with them, and at which forces act on those.
+        twist0: Twists whose momentum they have at the start.
+        internal: Forces of nodes that elements oppose, without damping.
     """
 
     def __init__(self, system: System, model: FrameModel, h: float, gradients: Gradients) -> None:
@@ -43,6 +46,8 @@ class FrameAdjoint:
         self.count = len(model.segment_frames)
         self.attachments = next(term for term in system.terms if isinstance(term, AttachmentTerm))
         self.inertial_v = self.end_v = shard.work.dof_v
+        self.pose = self.force_pose = shard.input["pose0"]
+        self.twist0, self.internal = shard.input["twist0"], shard.work.node_internal
         self.gyrates = wp.zeros(model.count, dtype=wp.int32, device=shard.device)
         self.as_solved = wp.full(model.count, int(Spin.AS_SOLVED), dtype=wp.int32, device=shard.device)
         self.splits = False  # whether gradients by the velocities that frames move on with go to ``kept`` alone
@@ -117,22 +122,33 @@ class FrameAdjoint:
         s.each_real(self.k.frame_seed, m.count, inputs, outputs)
 
     def carry(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
-        """Velocities and their adjoint of the nodes that frames carry, and what elements do along these."""
+        """Velocities and their adjoint of the nodes that frames carry."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [s.model.node_count, m.carried_slot, m.carried_frame, m.carried_offset, m.frame_dof]
-        inputs += [s.input["pose0"].real, w.dof_v.real, p.real]
+        inputs += [self.pose.real, w.dof_v.real, p.real]
         s.each_real(self.k.carried_motion, m.carried_count, inputs, [node_v.real, node_p.real])
+
+    def lift(self, node_v: Rows, node_p: Rows) -> None:
+        """What elements do along the velocities of nodes, as they feel them, and along the adjoint of these."""
+        s, m, w = self.shard, self.model, self.shard.work
         if self.lifts:
             self._find_products(node_v)
-            inputs = [self.h, m.carried_slot, w.node_internal.real, w.node_external.real, self.stiff.real]
+            inputs = [self.h, m.carried_slot, self.internal.real, w.node_external.real, self.stiff.real]
             s.each_real(self.k.carried_impulses, m.carried_count, inputs, [self.impulse.real])
             self._find_products(node_p)
 
     def _find_products(self, velocity: Rows) -> None:
         """k K v of the soft bodies' elements at the nodes that frames carry."""
+        s, w, second = self.shard, self.shard.work, self.shard.model.quadratic
         self.stiff.zero()
+        if second is not None and any(kind.velocity is w.gauss_corner_v for kind in self.attachments.held):
+            kernel = self.attachments.k_quadratic.point_corners
+            s.each(kernel, second.count, [second.element_node, velocity.S], [w.gauss_corner_v.S])
         for kind in self.attachments.held:
-            self.attachments.products.add(kind, self.shard.work.body_stiffness.S, velocity, self.stiff)
+            of_points = kind.velocity is w.gauss_corner_v
+            self.attachments.products.add(
+                kind, w.body_stiffness.S, kind.velocity if of_points else velocity, self.stiff
+            )
 
     def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
         """What carried nodes have goes to their frames; they have no gradients of their own."""
@@ -155,15 +171,7 @@ class FrameAdjoint:
         twists = [self.frame_v.real, self.frame_p.real]
         inputs = [m.frame_master, m.frame_offset, m.frame_dof, i["pose0"].real, w.dof_v.real, p.real]
         s.each_real(self.k_welded.twists, m.count, inputs, twists)
-        inputs = [m.seg_frame, m.seg_rod, m.seg_body, m.seg_length, m.seg_section, m.seg_scale, m.seg_rest]
-        inputs += [i["rod_youngs"].real, i["rod_nu"].real, w.body_stiffness.real, i["pose0"].real]
-        outputs = [self.corner.real, self.way.real, self.parameter.real]
-        s.each_real(self.k_segment.segment_adjoint, self.count, [*inputs, *twists, self.h], outputs)
-        inputs = [self.h, s.model.node_count, m.welded_frame, m.frame_master, m.frame_owner, m.frame_volume]
-        inputs += [m.slot_carried, m.carried_offset, m.corner_start, m.corner, w.owner_density.real]
-        inputs += [i["gravity"].real, i["command_frame_force"].real, i["pose0"].real, *twists]
-        inputs += [self.corner.real, self.way.real]
-        s.each_real(self.k_welded.gradients, m.welded_frame.size, inputs, [self.items.real])
+        self._to_segments()
         inputs = [self.h, s.lanes, m.frame_master, m.frame_dof, self.item_start, self.item]
         inputs += [m.corner_start, m.corner, self.is_kinematic]
         inputs += [i["pose0"].real, i["twist0"].real, w.compound.real, self.inertial_v.real, p.real]
@@ -171,13 +179,33 @@ class FrameAdjoint:
         outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
         s.each_real(self.k.frame_gradients, m.count, inputs, outputs)
 
-    def to_parameters(self, p: Rows) -> None:
-        """Add the gradients by parameters and gravity; needs ``to_state``."""
-        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+    def _to_segments(self) -> None:
+        """Gradients by the ends of segments, and what welded frames have for their masters."""
+        s, m, i, w = self.shard, self.model, self.shard.input, self.shard.work
+        twists = [self.frame_v.real, self.frame_p.real]
+        inputs = [m.seg_frame, m.seg_rod, m.seg_body, m.seg_length, m.seg_section, m.seg_scale, m.seg_rest]
+        inputs += [i["rod_youngs"].real, i["rod_nu"].real, w.body_stiffness.real, self.force_pose.real]
+        outputs = [self.corner.real, self.way.real, self.parameter.real]
+        s.each_real(self.k_segment.segment_adjoint, self.count, [*inputs, *twists, self.h], outputs)
+        inputs = [self.h, s.model.node_count, m.welded_frame, m.frame_master, m.frame_owner, m.frame_volume]
+        inputs += [m.slot_carried, m.carried_offset, m.corner_start, m.corner, w.owner_density.real]
+        inputs += [i["gravity"].real, i["command_frame_force"].real, self.force_pose.real, *twists]
+        inputs += [self.corner.real, self.way.real]
+        s.each_real(self.k_welded.gradients, m.welded_frame.size, inputs, [self.items.real])
+
+    def _to_sources(self, p: Rows) -> None:
+        """What parts of compounds have per density."""
+        s, m, i = self.shard, self.model, self.shard.input
         inputs = [self.h, self.source_frame, m.source, m.source_lever, m.source_inertia, m.frame_volume]
-        inputs += [s.model.node_volume, m.frame_dof, i["gravity"].real, i["pose0"].real, i["twist0"].real]
+        inputs += [s.model.node_volume, m.frame_dof, i["gravity"].real]
+        inputs += [i["pose0"].real, self.force_pose.real, self.twist0.real]
         inputs += [self.inertial_v.real, p.real, self.end_v.real, self.moved.real, self.share.real]
         s.each_real(self.k_part.sources, self.source_frame.size, inputs, [self.value.real])
+
+    def to_parameters(self, p: Rows) -> None:
+        """Add the gradients by parameters and gravity; needs ``to_state``."""
+        s, m, w, g = self.shard, self.model, self.shard.work, self.gradients
+        self._to_sources(p)
         self.share.zero()  # of one solution
         for lists, count, first, density, outputs in self.owners:
             inputs = [self.h, s.lanes, first, *lists, density.real, w.body_mass.real, self.value.real]

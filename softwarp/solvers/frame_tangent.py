@@ -23,7 +23,7 @@ from softwarp.solvers.system import System
 
 
 class FrameTangent(StepAdjoint):
-    """Imbalance and products with the transposed tangent, of the worlds of one system without soft bodies that move.
+    """Imbalance and products with the transposed tangent, of the worlds of one system.
 
     Args:
         system: Worlds, whose velocities are 0.
@@ -48,6 +48,14 @@ class FrameTangent(StepAdjoint):
         w.dof_v.zero()
         if m.row_count:
             self.find_activity()
+
+    def correct(self) -> None:
+        """Add to ``p`` what A answers to ``imbalance`` with; needs ``measure``."""
+        y = self.system.linear.y
+        y.zero()
+        self.shard.add(self.imbalance, y, self.shard.dof_rows)
+        self.system.linear.forward(1)
+        self.add_solution()
 
     def multiply(self) -> None:
         """Products with ``p``: h p . dr by poses; needs ``measure``."""

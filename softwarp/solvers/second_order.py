@@ -202,6 +202,11 @@ class SecondOrder:
 
     def take(self, number: int) -> None:
         """One stage, and the extrapolation behind it."""
+        self.solve(number)
+        self.extrapolate(number)
+
+    def solve(self, number: int) -> None:
+        """One stage."""
         stage = self.stages[number]
         if stage.keep and self._keeps_twice:
             self._copy(ALL, self.rough, self.moving, self.base)
@@ -211,8 +216,11 @@ class SecondOrder:
         if number == 0 and self.stages is BDF2:
             self._judge_contact()
             self._judge_strain(stage.length * self.h, VIOLENT)
-        if stage.factor != 1.0:
-            self._extrapolate(stage)
+
+    def extrapolate(self, number: int) -> None:
+        """The extrapolation behind a stage, if it has one."""
+        if self.stages[number].factor != 1.0:
+            self._extrapolate(self.stages[number])
 
     def _finish_rough(self) -> None:
         """The third stage of rough worlds."""

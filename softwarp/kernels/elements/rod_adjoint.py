@@ -22,12 +22,9 @@ PARAMETERS = 3  # rows of a segment: by Young's modulus, by Poisson's ratio, by 
 
 
 @single_worlds
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Kernels for one scalar type, on single worlds: (pack, row, lane)."""
-    real = variant.real
-    module = variant.module("adjoint.rod")
-    one = single.functions(variant)
-    vec3, vector_at, quat_at, put, logarithm = one.vec3, one.vector_at, one.quat_at, one.put, one.logarithm
+def functions(variant: Variant) -> SimpleNamespace:
+    """The logarithm of a turn, for one scalar type."""
+    real, vec3 = variant.real, single.functions(variant).vec3
     series, pole = logarithm_series(real)
     terms = len(series)
 
@@ -47,6 +44,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """A x of u = A d."""
         first = wp.cross(phi, x)
         return x - real(0.5) * first + c * wp.cross(phi, first)
+
+    return SimpleNamespace(slopes=slopes, twisted=twisted)
+
+
+@single_worlds
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type, on single worlds: (pack, row, lane)."""
+    real = variant.real
+    module = variant.module("adjoint.rod")
+    one = single.functions(variant)
+    vec3, vector_at, quat_at, put, logarithm = one.vec3, one.vector_at, one.quat_at, one.put, one.logarithm
+    f = functions(variant)
+    slopes, twisted = f.slopes, f.twisted
 
     @wp.func
     def change(d: vec3, phi: vec3, u: vec3, c: real, dc: real, way: vec3, first: vec3, second: vec3):

@@ -25,6 +25,40 @@ from softwarp.model.codes import Spin
 
 
 @single_worlds
+def functions(variant: Variant) -> SimpleNamespace:
+    """Gradients by turns, for one scalar type."""
+    real = variant.real
+    one = single.functions(variant)
+    vec3, mat33, quat = one.vec3, one.mat33, one.quat
+
+    @wp.func
+    def turn_bar(q: quat, by_u: vec3, by_s: real):
+        """Gradient by a turn from those by the vector and the scalar part of a quaternion."""
+        u = vec3(q[0], q[1], q[2])
+        return real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - by_s * u)
+
+    @wp.func
+    def by_turn(s: vec3, J: mat33, bt: vec3, br: vec3, at: vec3, ar: vec3):
+        """Gradient of b.M a by the turn of M."""
+        return wp.cross(s, wp.cross(bt, ar) + wp.cross(at, br)) + wp.cross(J * ar, br) + wp.cross(J * br, ar)
+
+    @wp.func
+    def jacobian_transposed(v: vec3, x: vec3):
+        """T(v)' x, T = 1 + (1 - cos a)/a^2 [v] + (a - sin a)/a^3 [v]^2."""
+        y = wp.dot(v, v)
+        first = real(0.5) - y / real(24.0)
+        second = real(1.0) / real(6.0) - y / real(120.0)
+        if y > real(1.0e-4):
+            a = wp.sqrt(y)
+            first = (real(1.0) - wp.cos(a)) / y
+            second = (a - wp.sin(a)) / (a * y)
+        c = wp.cross(v, x)
+        return x - first * c + second * wp.cross(v, c)
+
+    return SimpleNamespace(turn_bar=turn_bar, by_turn=by_turn, jacobian_transposed=jacobian_transposed)
+
+
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type, on single worlds."""
     real = variant.real
@@ -34,6 +68,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
     compounds = of_compounds(variant)
     turned, momentum = compounds.turned, compounds.momentum
+    turns = functions(variant)
+    turn_bar, by_turn, jacobian_transposed = turns.turn_bar, turns.by_turn, turns.jacobian_transposed
     slowed = slowing(variant).slowed
     of_end = of_momentum.functions(variant)
     change_of_twist, inertia_inverse = of_end.change_of_twist, of_end.inertia_inverse
@@ -52,12 +88,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         scale = real(1.0) / wp.trace(about)
         w = scale * (wp.inverse(scale * about) * (L - wp.cross(s, P) / m))
         return (P - wp.cross(w, s)) / m, w
-
-    @wp.func
-    def turn_bar(q: quat, by_u: vec3, by_s: real):
-        """Gradient by a turn from those by the vector and the scalar part of a quaternion."""
-        u = vec3(q[0], q[1], q[2])
-        return real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - by_s * u)
 
     @wp.func
     def moved_on(
@@ -92,24 +122,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
             rest_v = by_v - had_p
             rest_w = by_w - had_l
         return c_t, c_r, rest_v, rest_w
-
-    @wp.func
-    def by_turn(s: vec3, J: mat33, bt: vec3, br: vec3, at: vec3, ar: vec3):
-        """Gradient of b.M a by the turn of M."""
-        return wp.cross(s, wp.cross(bt, ar) + wp.cross(at, br)) + wp.cross(J * ar, br) + wp.cross(J * br, ar)
-
-    @wp.func
-    def jacobian_transposed(v: vec3, x: vec3):
-        """T(v)' x, T = 1 + (1 - cos a)/a^2 [v] + (a - sin a)/a^3 [v]^2."""
-        y = wp.dot(v, v)
-        first = real(0.5) - y / real(24.0)
-        second = real(1.0) / real(6.0) - y / real(120.0)
-        if y > real(1.0e-4):
-            a = wp.sqrt(y)
-            first = (real(1.0) - wp.cos(a)) / y
-            second = (a - wp.sin(a)) / (a * y)
-        c = wp.cross(v, x)
-        return x - first * c + second * wp.cross(v, c)
 
     @wp.func
     def put_both(out: wp.array3d(dtype=real), pack: int, lane: int, t: int, r: int, linear: vec3, angular: vec3):

@@ -89,6 +89,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         gravity_in: wp.array3d(dtype=real),
         pose0_in: wp.array3d(dtype=real),
+        force_pose_in: wp.array3d(dtype=real),
         twist0_in: wp.array3d(dtype=real),
         v_in: wp.array3d(dtype=real),
         p_in: wp.array3d(dtype=real),
@@ -149,7 +150,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         had += (
             turning + on + wp.dot(P, vector_at(end_v_in, pack, lane, t)) + wp.dot(L, vector_at(end_v_in, pack, lane, r))
         )
-        pt += wp.cross(vector_at(p_in, pack, lane, r), wp.quat_rotate(q, x))
+        pt += wp.cross(
+            vector_at(p_in, pack, lane, r), wp.quat_rotate(quat_at(force_pose_in, pack, lane, 7 * frame + 3), x)
+        )
         value_out[pack, 2 * item, lane] = had + h * weight * wp.dot(pt, vector_at(gravity_in, pack, lane, 0))
         value_out[pack, 2 * item + 1, lane] = has
 

@@ -215,6 +215,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         is_stage: bool,
         # Model
         cable_force_control: wp.array(dtype=wp.int32),
+        cable_stretches: wp.array(dtype=wp.int32),
         # Workspace in
         displacement_command_in: wp.array3d(dtype=real),
         tension_command_in: wp.array3d(dtype=real),
@@ -262,7 +263,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             command = displacement_command_in[pack, cable, lane]
             low = min_displacement_in[pack, cable, lane]
             high = max_displacement_in[pack, cable, lane]
-            lag = lag_in[pack, 0, lane]
+            lag = none
+            if cable_stretches[cable] == 0:
+                lag = lag_in[pack, 0, lane]
             way = wp.min(wp.max(command, low), high) - displacement_in[pack, cable, lane]
             way = way - lag * way
             if wp.abs(way) > max_rate_in[pack, cable, lane] * lapse:
@@ -282,6 +285,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def cable_stretch(
         lapse: real,
         lanes: int,
+        is_stage: bool,
         # Model
         cable_force_control: wp.array(dtype=wp.int32),
         # Workspace in
@@ -298,11 +302,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         damping_bar_out: wp.array2d(dtype=real),
         # Workspace out
         measured_out: wp.array3d(dtype=real),
+        start_out: wp.array3d(dtype=real),
     ):
         """Turn the gradients of one cable's command into those of an elastic one, and add those by its constants.
 
         With the rate r = c / ``lapse``, C = 1 / (k + r) and the target D of a cable that does not stretch, its row has
-        the target d + k C (D - d) and the compliance C.
+        the target d + k C (D - d) and the compliance C; d is that of the start in a stage.
         """
         pack, cable, lane = wp.tid()
         world = pack * lanes + lane
@@ -312,7 +317,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
             rate = damping_in[pack, cable, lane] / lapse
             way = (target_in[pack, cable, lane] - displacement_in[pack, cable, lane]) / (k * C)  # D - d
             by_square = q_in[pack, cable, lane] * C * C
-            measured_out[pack, cable, lane] = measured_out[pack, cable, lane] * k * C
+            if is_stage:
+                start_out[pack, cable, lane] = q_in[pack, cable, lane] * (real(1.0) - k * C) + start_out[
+                    pack, cable, lane
+                ] * (k * C)
+            else:
+                measured_out[pack, cable, lane] = measured_out[pack, cable, lane] * k * C
             if world < stiffness_bar_out.shape[0]:
                 force = multiplier_in[pack, cable, lane]
                 by_k = by_square * (force + rate * way)

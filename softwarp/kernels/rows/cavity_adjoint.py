@@ -93,6 +93,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lapse: real,
         lanes: int,
         first_row: int,
+        is_stage: bool,
         # Model
         cavity_control: wp.array(dtype=wp.int32),
         cavity_area: wp.array(dtype=real),
@@ -110,6 +111,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         ambient_in: wp.array3d(dtype=real),
         exponent_in: wp.array3d(dtype=real),
         pressure_in: wp.array3d(dtype=real),
+        start_volume_in: wp.array3d(dtype=real),
         volume_in: wp.array3d(dtype=real),
         goal_in: wp.array3d(dtype=real),
         lag_in: wp.array3d(dtype=real),
@@ -123,12 +125,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pressure_bar_out: wp.array2d(dtype=real),
         # Workspace out
         measured_out: wp.array3d(dtype=real),
+        start_out: wp.array3d(dtype=real),
     ):
         """Gradients by the commands of one chamber and by its pressure before the step, and ``measured``.
 
         A commanded pressure counts where no limit and no rate in the time ``lapse`` [s] overrules it, a volume and a
         gas likewise with the flow in the step ``h`` [s]. What a rate has bounded moves with the pressure or the volume
-        at the start instead, and so does the target of a volume that is too far for one linearisation.
+        at the start instead, and so does the target of a volume that is too far for one linearisation. A stage has its
+        rows elsewhere than where it starts: ``start`` is the factor of the volume's gradient there.
         """
         pack, cavity, lane = wp.tid()
         world = pack * lanes + lane
@@ -139,6 +143,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         high = max_pressure_in[pack, cavity, lane]
         q = q_in[pack, row, lane]
         pressure = pressure_in[pack, cavity, lane]
+        before = start_volume_in[pack, cavity, lane]
         volume = volume_in[pack, cavity, lane]
         flow = max_flow_in[pack, cavity, lane] * h
         by_pressure_command = none
@@ -146,6 +151,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         by_gas_command = none
         by_pressure = none
         measured = none
+        start = none
         control = cavity_control[cavity]
         if control == wp.static(CavityControl.PRESSURE):
             command = pressure_command_in[pack, cavity, lane]
@@ -160,16 +166,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             stride = real(wp.static(STRIDE))
             by_command, by_volume = volume_target(
                 volume_command_in[pack, cavity, lane],
-                volume,
+                before,
                 min_volume_in[pack, cavity, lane],
                 max_volume_in[pack, cavity, lane],
                 lag_in[pack, 0, lane],
                 flow,
-                wp.max(volume, rest) * stride,
-                wp.where(volume > rest, stride, none),
+                wp.max(before, rest) * stride,
+                wp.where(before > rest, stride, none),
             )
             by_volume_command = q / area * by_command
-            measured = q * (by_volume - real(1.0))
+            measured = -q
+            start = q * by_volume
         if control == wp.static(CavityControl.GAS):
             ambient = ambient_in[pack, cavity, lane]
             exponent = exponent_in[pack, cavity, lane]
@@ -179,11 +186,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if gas_command_in[pack, cavity, lane] == goal:
                 by_gas_command = q / area * by_goal
             elif pressure + ambient > none:  # a flow has bounded it, around what the chamber holds
-                held = volume * wp.pow((pressure + ambient) / ambient, real(1.0) / exponent)
+                held = before * wp.pow((pressure + ambient) / ambient, real(1.0) / exponent)
                 by_pressure = q / area * by_goal * held / (exponent * (pressure + ambient))
-                by_volume += by_goal * held / volume
+                start = q * by_goal * held / before
             measured = q * by_volume
+        if not is_stage:
+            measured += start
         measured_out[pack, row, lane] = measured
+        start_out[pack, row, lane] = start
         if world < pressure_bar_out.shape[0]:
             pressure_command_bar_out[world, cavity] = by_pressure_command
             volume_command_bar_out[world, cavity] = by_volume_command

@@ -9,68 +9,76 @@ by M, by x, and by K and H. With s = A p, the seed less h H' q, K p is (s - m M 
 State arrays are ``[world, row]``; workspace arrays ``[pack, row, lane]``.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra import single
-from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 
-@cache
+@single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     real = variant.real
     module = variant.module("adjoint.stage")
     one = single.functions(variant)
-    vec3, vector_at, put = one.vec3, one.vector_at, one.put
-
-    @wp.kernel(module=module, enable_backward=False)
-    def velocities(
-        h: real,
-        # Model
-        node_dof: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        # Workspace in
-        beta_in: wp.array3d(dtype=real),
-        node_v_in: wp.array3d(dtype=real),
-        start_v_in: wp.array3d(dtype=real),
-        # Workspace out
-        element_v_out: wp.array3d(dtype=real),
-        row_v_out: wp.array3d(dtype=real),
-    ):
-        """What elements and rows have in the place of the velocity of one node; ``start_v_in`` is of dofs."""
-        pack, node, lane = wp.tid()
-        v = vector_at(node_v_in, pack, lane, 3 * node)
-        dof = node_dof[node]
-        v0 = vec3()
-        if dof >= 0:
-            v0 = vector_at(start_v_in, pack, lane, 3 * dof)
-        share = h / (h + beta_in[pack, node_body[node], lane])
-        put(element_v_out, pack, lane, 3 * node, v - share * v0)
-        put(row_v_out, pack, lane, 3 * node, v - v0)
+    vec3, vector_at, quat_at, put, add_to = one.vec3, one.vector_at, one.quat_at, one.put, one.add_to
 
     @wp.kernel(module=module, enable_backward=False)
     def start_points(
         # Model
-        point_cable: wp.array(dtype=wp.int32),
+        point_row: wp.array(dtype=wp.int32),
         # Workspace in
         point_gradient_in: wp.array3d(dtype=real),
         start_in: wp.array3d(dtype=real),
         # Workspace out
         point_bar_out: wp.array3d(dtype=real),
     ):
-        """Gradient by one point of a cable where the stage started, by its displacement there."""
+        """Gradient by one point of a row where the stage started, by its displacement there."""
         pack, point, lane = wp.tid()
         here = vector_at(point_gradient_in, pack, lane, 3 * point)
-        put(point_bar_out, pack, lane, 3 * point, start_in[pack, point_cable[point], lane] * here)
+        put(point_bar_out, pack, lane, 3 * point, start_in[pack, point_row[point], lane] * here)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def start_frames(
+        nodes: int,
+        # Model
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        point_bar_in: wp.array3d(dtype=real),
+        # Workspace out
+        start_out: wp.array3d(dtype=real),
+    ):
+        """Add what the points that one frame carries have where the stage started, by its place and turn there."""
+        pack, frame, lane = wp.tid()
+        q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+        place = vec3()
+        turn = vec3()
+        for k in range(frame_item_start[frame], frame_item_start[frame + 1]):
+            item = frame_item[k]
+            node = carried_slot[item]
+            if node < nodes:
+                total = vec3()
+                for i in range(node_point_start[node], node_point_start[node + 1]):
+                    total += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
+                offset = vec3(carried_offset[item, 0], carried_offset[item, 1], carried_offset[item, 2])
+                place += total
+                turn += wp.cross(wp.quat_rotate(q, offset), total)
+        add_to(start_out, pack, lane, 6 * frame, place)
+        add_to(start_out, pack, lane, 6 * frame + 3, turn)
 
     @wp.kernel(module=module, enable_backward=False)
     def nodes(
         h: real,
         lanes: int,
-        cable_points: int,
         # Model
         node_dof: wp.array(dtype=wp.int32),
         node_body: wp.array(dtype=wp.int32),
@@ -111,8 +119,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 share = h / (h + beta_in[pack, body, lane])  # h^2 / k
                 by_v = h * by_x + seed - pushed + share * (pushed - body_mass_in[pack, body, lane] * mass_p)
             for i in range(node_point_start[node], node_point_start[node + 1]):
-                if node_point[i] < cable_points:
-                    by_x += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
+                by_x += node_point_weight[i] * vector_at(point_bar_in, pack, lane, 3 * node_point[i])
             for c in range(3):
                 row = 3 * node + c
                 found = mass_p[c]
@@ -121,38 +128,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 x_bar_out[world, row] = x_bar_out[world, row] + by_x[c]
                 v_bar_out[world, row] = found
                 force_bar_out[world, row] = h * node_p_in[pack, row, lane]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def damping(
-        h: real,
-        lanes: int,
-        # Model
-        body_node_start: wp.array(dtype=wp.int32),
-        node_dof: wp.array(dtype=wp.int32),
-        # Workspace in
-        density_in: wp.array3d(dtype=real),
-        beta_in: wp.array3d(dtype=real),
-        body_mass_in: wp.array3d(dtype=real),
-        pushed_in: wp.array3d(dtype=real),
-        start_v_in: wp.array3d(dtype=real),
-        node_mass_p_in: wp.array3d(dtype=real),
-        # State out
-        rayleigh_stiffness_bar_out: wp.array2d(dtype=real),
-    ):
-        """Make the gradient by beta of one body that of h v, from that of h (v - h^2 / k v0) which elements gave."""
-        pack, body, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < rayleigh_stiffness_bar_out.shape[0]:
-            total = real(0.0)
-            for node in range(body_node_start[body], body_node_start[body + 1]):
-                dof = node_dof[node]
-                if dof >= 0:
-                    mass_p = density_in[pack, body, lane] * vector_at(node_mass_p_in, pack, lane, 3 * node)
-                    product = vector_at(pushed_in, pack, lane, 3 * dof) - body_mass_in[pack, body, lane] * mass_p
-                    total += wp.dot(product, vector_at(start_v_in, pack, lane, 3 * dof))
-            length = h + beta_in[pack, body, lane]
-            change = h / (length * length) * total  # h (h^2 / k) / k
-            rayleigh_stiffness_bar_out[world, body] = rayleigh_stiffness_bar_out[world, body] - change
 
     @wp.kernel(module=module, enable_backward=False)
     def part(
@@ -181,10 +156,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         sum_out[world, row] = sum_out[world, row] + bar_in[world, row]
 
     return SimpleNamespace(
-        velocities=velocities,
         start_points=start_points,
+        start_frames=start_frames,
         nodes=nodes,
-        damping=damping,
         part=part,
         add=add,
     )

@@ -81,5 +81,5 @@ class QuadraticTerm(Term):
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.mass_row, m.mass_row_start, m.mass_row_body, m.mass_column, m.mass_column_node]
         inputs += [m.mass_column_volume, s.input["density"].S, w.body_mass.S, w.body_damping.S]
-        inputs += [s.felt["v0"].S, s.felt["dof_v"].S, moving]
+        inputs += [s.felt["v0"].S, s.felt["dof_v"].S, moving or s.leaning]
         s.each(self.k_inertia.add_momentum, m.mass_row.size, inputs, [w.b.S])

@@ -147,10 +147,12 @@ def test_what_does_not_come_to_rest_is_told() -> None:
         equilibrium(max_iterations=2)
 
 
-def _soft(builder: sw.ModelBuilder) -> None:
+def _inflated(builder: sw.ModelBuilder) -> None:
     from softwarp import meshing
 
-    builder.add_tets(meshing.box((0.1, 0.1, 0.1), (1, 1, 1)), material=sw.Corotational(1e5, 0.4), density=1e3)
+    mesh, skin = meshing.box((0.1, 0.1, 0.1), (1, 1, 1)), meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
+    body = builder.add_tets(mesh, material=sw.Corotational(1e5, 0.4), density=1e3)
+    builder.add_cavity(body, skin.nodes + 0.03, skin.surface())
 
 
 def _length(builder: sw.ModelBuilder) -> None:
@@ -170,7 +172,7 @@ def _base(builder: sw.ModelBuilder) -> None:
 @pytest.mark.parametrize(
     ("build", "told"),
     [
-        (_soft, "beside soft bodies"),
+        (_inflated, "beside chambers"),
         (_length, "whose length is"),
         (_hinge, "beside joints"),
         (_base, "beside kinematic"),

@@ -110,6 +110,31 @@ def test_many_measurements_are_fitted_along_gradients(count: int, method: str) -
     assert [m for m, found in told.items() if found.values == chosen.values] == [method]
 
 
+def test_few_parameters_take_few_gradients() -> None:
+    """In the metric of differences at the start a fit of two parameters takes two or three candidates more."""
+    asked, pulled = [], []
+
+    class Counted(Differentiable):
+        def pull(self, values: np.ndarray, by: np.ndarray) -> np.ndarray:
+            pulled.append(values)
+            return super().pull(values, by)
+
+    def decay(values: torch.Tensor) -> torch.Tensor:
+        asked.append(values)
+        return values[:, 1:] * torch.exp(-values[:, :1] * X) - 2.0 * torch.exp(-5.9 * X) - noise
+
+    noise = torch.tensor(0.05 * np.random.default_rng(0).standard_normal(len(X)))
+    parameters = [Parameter("rate", 1.0, 10.0, start=5.5), Parameter("size", 0.5, 4.0, start=1.8)]
+    found = fit(parameters, Counted(decay), method="gradient", tolerance=1e-3)
+    asked_for, gradients = len(asked), len(pulled)
+    best = fit(parameters, Differentiable(decay), method="least_squares", tolerance=1e-12)
+    assert found.converged
+    assert found.rmse == pytest.approx(best.rmse, rel=1e-3)
+    assert found.values == pytest.approx(best.values, rel=1e-2)
+    assert asked_for <= 7
+    assert gradients <= 4
+
+
 @pytest.mark.parametrize("method", ["least_squares", "gradient"])
 def test_a_model_that_diverges_on_the_way(method: str) -> None:
     """A candidate that diverges is stepped back from; one that does at the start is refused."""

@@ -1,0 +1,291 @@
+"""Soft bodies at rest that rigid bodies and rods carry or that carry these, and gradients of where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import warp as wp
+
+from softwarp import interop
+from softwarp.gradients.frame_equilibrium import by_turn
+from softwarp.gradients.refusals import Diverged
+from softwarp.gradients.worlds import Replayed
+from softwarp.model.gradients import FRAMES, Gradients
+from softwarp.model.state import Control, Parameters, State, create, worlds_slice
+from softwarp.simulation import Simulation
+from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.frame_tangent import FrameTangent
+from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.threads import Workers
+
+Tensors = Mapping[str, torch.Tensor]
+LONG = 1.0e3  # s, of a step without momentum, whose matrix is the tangent of the forces to rounding
+STEPS = 30  # such steps, at most
+CORRECTIONS = 100  # of an adjoint, at most
+WAY = {"float32": 3.0e-6, "float64": 1.0e-11}  # extents, and rad, of the last step
+LEFT = {"float32": 1.0e-4, "float64": 1.0e-12}  # of a gradient: what an adjoint may leave
+PLACES = ("node_x", "frame_pose")
+
+
+class CarriedWorlds:
+    """As many worlds as a simulation has, at rest.
+
+    Static solves of the simulation lead near, steps without momentum to rounding: each is a step of Newton's method
+    with the matrix K of a step. The adjoint has the exact tangent R, with levers that turn and the stiffness of taut
+    cables: products R' p are those of the adjoint of a step, and K's factor corrects what they leave,
+
+        p += K^-1 (y + R' p).
+
+    Args:
+        sim: Soft bodies beside rods and rigid bodies; cables under force control.
+
+    Attributes:
+        state, control, parameters: Views of these worlds' arrays.
+        gradients: Views of ``Gradients``.
+        solved: Number of the equilibrium that the worlds are in.
+    """
+
+    def __init__(self, sim: Simulation) -> None:
+        self.sim, self.model = sim, sim.model
+        model = sim.model
+        containers = create(State, model), create(Control, model), create(Parameters, model)
+        arrays = create(Gradients, model)
+        self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
+        self.gradients = interop.views(arrays, model)
+        self.state |= interop.frame_aliases(self.state, model, *FRAMES)
+        self.control |= interop.force_aliases(self.control, model)
+        named = {"frame_force": self.gradients["command_frame_force"]}
+        for name, view in interop.force_aliases(named, model).items():
+            self.gradients[f"command_{name}"] = view
+        twins, index = sim.make_twins(*containers), AdjointIndex.of(model)
+        parts = [
+            FrameTangent(system, LONG, worlds_slice(arrays, each.start, each.stop), index) for each, system in twins
+        ]
+        steppers = [ImplicitEuler(system, LONG) for _, system in twins]
+        workers = Workers(len(twins)) if len(twins) > 1 else None
+        self._measure, self._multiply, self._multiply_all, self._correct = (
+            Replayed(model.device, [getattr(part, name) for part in parts], workers)
+            for name in ("measure", "multiply", "multiply_all", "correct")
+        )
+        self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
+        self._counts = [each.stop - each.start for each, _ in twins]
+        self._p, self._left = (
+            [wp.to_torch(getattr(part, name).real, requires_grad=False) for part in parts]
+            for name in ("p", "imbalance")
+        )
+        self._find_unknowns()
+        self._last: dict[str, torch.Tensor] | None = None
+        self.solved, self._measured = 0, -1
+
+    def _find_unknowns(self) -> None:
+        """Where the unknowns of nodes and frames are, and which node moves with which frame."""
+        model, frames, device = self.model, self.model.frames, self.state["node_x"].device
+        assert frames is not None
+        slot = torch.as_tensor(model.dof_node.numpy(), device=device).long()
+        self._free = torch.as_tensor(model.dof_free.numpy().reshape(-1, 3) != 0.0, device=device)
+        self._nodes = (slot < model.node_count).nonzero().flatten()
+        self._node = slot[self._nodes]
+        halves = (slot >= model.node_count).nonzero().flatten()
+        half = slot[halves] - model.node_count
+        inside = half < 2 * frames.count
+        self._halves, self._half = halves[inside], half[inside]
+        carrier = torch.as_tensor(frames.node_frame.numpy()[: model.node_count], device=device).long()
+        self._carried = (carrier >= 0).nonzero().flatten()
+        self._carrier = carrier[self._carried]
+
+    def start(self, given: Tensors) -> None:
+        """Take over what the simulation has, and what is given by names as ``control.body_force``."""
+        sources = self.sim.state_tensors(), self.sim.control.tensors(), self.sim.params.tensors()
+        for views, held in zip((self.state, self.control, self.parameters), sources, strict=True):
+            for name, value in held.items():
+                if name in views:
+                    views[name].copy_(value)
+        self.give(given)
+
+    def give(self, given: Tensors) -> None:
+        """Put what is given in place."""
+        groups = {"control": self.control, "params": self.parameters}
+        for name, value in given.items():
+            group, _, own = name.partition(".")
+            groups[group][own].copy_(value)
+
+    def settle(self, given: Tensors, tolerance: float | None, most: int, *, warm: bool) -> torch.Tensor:
+        """Bring all worlds to rest; which ones are there, (world,).
+
+        Args:
+            given: As of ``start``.
+            tolerance: Way of the last step, in extents and rad; None takes ``WAY``.
+            most: Iterations of the static solve.
+            warm: Whether to begin where the last equilibrium was.
+        """
+        limit = WAY[self.model.precision] if tolerance is None else tolerance
+        self.start(given)
+        arrived = torch.zeros(self.model.num_worlds, dtype=torch.bool, device=self._free.device)
+        if warm and self._last is not None:
+            for name, value in self._last.items():
+                self.state[name].copy_(value)
+            arrived = self._polish(limit)
+        if not arrived.all():
+            held = {name: self.state[name].clone() for name in PLACES}
+            found = self._solve(given, most)
+            for name, value in found.items():
+                mask = arrived.reshape(-1, *[1] * (value.ndim - 1))
+                self.state[name].copy_(torch.where(mask, held[name], value))
+            arrived = self._polish(limit)
+        self._last = {name: self.state[name].clone() for name in PLACES}
+        self.solved += 1
+        return arrived
+
+    def _solve(self, given: Tensors, most: int) -> dict[str, torch.Tensor]:
+        """Where the simulation's own solve leads, which leaves the simulation as it is."""
+        sim = self.sim
+        before = sim.snapshot()
+        try:
+            groups = {"control": sim.control.tensors(), "params": sim.params.tensors()}
+            for name, value in given.items():
+                group, _, own = name.partition(".")
+                groups[group].get(own, getattr(getattr(sim, group), own)).copy_(value)
+            sim.follow_static(max_iterations=most)
+            return {name: value.clone() for name, value in sim.state_tensors().items() if name in PLACES}
+        finally:
+            sim.restore(before)
+
+    def _rest(self) -> None:
+        for name in ("node_v", "frame_twist", "node_memory", "frame_memory"):
+            self.state[name].zero_()
+
+    def _polish(self, limit: float) -> torch.Tensor:
+        """Steps without momentum, of every world until one goes nowhere; which ones came to that."""
+        places = {name: self.state[name].clone() for name in PLACES}
+        arrived = torch.zeros(self.model.num_worlds, dtype=torch.bool, device=self._free.device)
+        for _ in range(STEPS):
+            self._rest()
+            self._step()
+            way = (self.state["node_x"] - places["node_x"]).flatten(1).abs().amax(dim=1) / self.model.extent
+            turn = (self.state["frame_pose"] - places["frame_pose"])[..., 3:].flatten(1).abs().amax(dim=1)
+            for name, value in places.items():
+                mask = arrived.reshape(-1, *[1] * (value.ndim - 1))
+                places[name] = torch.where(mask, value, self.state[name])
+                self.state[name].copy_(places[name])
+            arrived |= torch.maximum(way, turn) <= limit
+            if arrived.all():
+                break
+        self._rest()
+        return arrived
+
+    # Gradients
+
+    def pull(
+        self, number: int, given: Tensors, places: dict[str, torch.Tensor], by_x: torch.Tensor, by_pose: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """Gradients by what is given from those by positions of nodes and poses of frames, at an equilibrium.
+
+        Args:
+            number: Of the equilibrium; that of the last one stands.
+            given: As of ``start``.
+            places: Its positions and poses.
+            by_x: (world, node, 3).
+            by_pose: (world, frame, 7).
+
+        Raises:
+            Diverged: If the adjoint of a world does not come to an end.
+        """
+        if number != self._measured:
+            self.start(given)
+            for name, value in places.items():
+                self.state[name].copy_(value)
+            self._rest()
+            self._measure()
+            self._measured = number
+        pose = places["frame_pose"]
+        turn = by_turn(pose[..., 3:], by_pose[..., 3:])
+        place = by_pose[..., :3].clone()
+        lever = places["node_x"][:, self._carried] - pose[:, self._carrier, :3]
+        push = by_x[:, self._carried]
+        place.index_add_(1, self._carrier, push)
+        turn = turn.index_add(1, self._carrier, torch.linalg.cross(lever, push))
+        y = self._gathered(by_x, torch.stack([place, turn], dim=2))
+        self._find_adjoint(y)
+        for gradient in self.gradients.values():
+            gradient.zero_()
+        self._multiply_all()
+        named = {n: n.replace("control.", "command_").replace("params.", "") for n in given}
+        return {name: self.gradients[own] for name, own in named.items()}
+
+    def _gathered(self, by_x: torch.Tensor, by_halves: torch.Tensor) -> torch.Tensor:
+        """Unknowns, (world, 3 dof), from what nodes and both halves of frames have, (world, frame, 2, 3)."""
+        found = by_x.new_zeros((len(by_x), *self._free.shape))
+        found[:, self._nodes] = by_x[:, self._node]
+        found[:, self._halves] = by_halves.flatten(1, 2)[:, self._half]
+        return (found * self._free).flatten(1)
+
+    def _find_adjoint(self, y: torch.Tensor) -> None:
+        """p with y + h R' p = 0, into the shards."""
+        for p in self._p:
+            p.zero_()
+        size = y.abs().amax(dim=1)
+        left, going = y, size > 0.0
+        limit, before = LEFT[self.model.precision], size
+        for _ in range(CORRECTIONS):
+            self._put(torch.where(going[:, None], LONG * left, 0.0))
+            self._correct()
+            for name in PLACES:
+                self.gradients[name].zero_()
+            self._multiply()
+            pose = self.gradients["frame_pose"]
+            turn = by_turn(self.state["frame_pose"][..., 3:], pose[..., 3:])
+            halves = torch.stack([pose[..., :3], turn], dim=2)
+            left = y + self._gathered(self.gradients["node_x"], halves)
+            now = left.abs().amax(dim=1)
+            going = going & (now > limit * size)
+            if not going.any():
+                return
+            if bool((going & ~(now < 1.0e3 * size)).any()):
+                break
+            before = now
+        worlds = (going & ~(before <= 1.0e2 * limit * size)).nonzero().flatten().tolist()
+        if worlds:
+            listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
+            raise Diverged(
+                f"equilibrium: the gradient of {len(worlds)} worlds ({listed}) is not found by corrections, as near "
+                "where something buckles; take milder commands, or a Rollout with damping that comes to rest"
+            )
+
+    def _put(self, rows: torch.Tensor) -> None:
+        """Unknowns into the shards."""
+        begin = 0
+        for view, count in zip(self._left, self._counts, strict=True):
+            packs, _, lanes = view.shape
+            part = rows.new_zeros((packs * lanes, rows.shape[1]))
+            part[:count] = rows[begin : begin + count]
+            view.zero_()
+            view[:, : rows.shape[1]] = part.reshape(packs, lanes, -1).permute(0, 2, 1)
+            begin += count
+
+
+class AtRestTogether(torch.autograd.Function):
+    """One solve as one operation: positions of nodes and poses of frames."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, owner: Any, names: tuple[str, ...], limits: dict[str, Any], *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Where they are."""
+        worlds: CarriedWorlds = owner.carried
+        given = dict(zip(names, tensors, strict=True))
+        arrived = worlds.settle(given, limits["tolerance"], limits["max_iterations"], warm=owner.warm)
+        owner.check(arrived, torch.zeros(len(arrived)))
+        places = tuple(worlds.state[name].clone() for name in PLACES)
+        ctx.worlds, ctx.names, ctx.number = worlds, names, worlds.solved
+        ctx.save_for_backward(*places, *tensors)
+        return places
+
+    @staticmethod
+    def backward(ctx: Any, by_x: torch.Tensor, by_pose: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Gradients by all tensors."""
+        x, pose, *tensors = ctx.saved_tensors
+        given = dict(zip(ctx.names, tensors, strict=True))
+        found = ctx.worlds.pull(ctx.number, given, dict(zip(PLACES, (x, pose), strict=True)), by_x, by_pose)
+        return (None, None, None, *(found[name].clone() for name in ctx.names))
