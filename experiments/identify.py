@@ -29,7 +29,6 @@ CASES = {  # module of this folder with ``identify(extra, **options) -> Fit``
     "segment": "real_segment",
     "tentacle": "real_tentacle",
 }
-WITH_GRADIENT = ("beam", "segment", "tentacle")  # cases whose residuals torch differentiates
 ON_DEVICES = ("tentacle",)  # cases whose ``identify`` takes ``devices``
 
 
@@ -51,9 +50,6 @@ def main(arguments: Sequence[str]) -> int:
     args = parser.parse_args(arguments)
     if args.case not in CASES:
         raise ValueError(f"there is no case {args.case!r}; {advice.nearest(args.case, CASES)}")
-    if args.method == "gradient" and args.case not in WITH_GRADIENT:
-        told = f"residuals of {args.case} are not differentiated, only those of {', '.join(WITH_GRADIENT)}"
-        raise ValueError(f"--method gradient: {told}; take another method")
     if args.json and args.json != "-":
         prove_writable(args.json)
     options: dict[str, Any] = {"method": args.method, "seed": args.seed}

@@ -221,13 +221,14 @@ class Case:
         )
         frequency = (len(known) - 1) / (times[-1] - times[0])
         peaks = known[0] / peaks[0] * peaks
-        return torch.cat(
+        errors = torch.cat(
             [
-                (rest - heights) / torch.hypot(STATIC[0] * heights, torch.full_like(heights, STATIC[1])),
-                ((frequency / told["frequency"] - 1.0) / FREQUENCY)[None],
-                ((peaks - known) / torch.hypot(PEAK[0] * known, torch.full_like(known, PEAK[1])))[1:],
+                (rest - heights) / STATIC_BAR.get(self.fitted[number], 0.4),
+                ((frequency / told["frequency"] - 1.0) / FREQUENCY_BAR)[None],
+                ((peaks - known) / (PEAK_BAR * known))[1:],
             ]
         )
+        return errors * errors.abs()
 
     def _residuals(self, loads: list[dict[str, Any]]) -> Floats:
         """Squares of differences in units of what they may be, with their signs.

@@ -178,8 +178,6 @@ def test_verbs_refuse_wrong_names(capsys):
     assert "no case 'tentacl'; did you mean 'tentacle'" in capsys.readouterr().err
     assert cli.main(["identify", "segmnt"]) == cli.BAD_INPUT
     assert "no case 'segmnt'; did you mean 'segment'" in capsys.readouterr().err
-    assert cli.main(["identify", "beam", "--method", "gradient"]) == cli.BAD_INPUT
-    assert "residuals of beam are not differentiated, only those of segment, tentacle" in capsys.readouterr().err
 
 
 def test_page_and_json(tmp_path, monkeypatch, capsys):
