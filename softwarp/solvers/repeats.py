@@ -22,12 +22,11 @@ from softwarp.solvers.options import Options
 from softwarp.solvers.system import System
 
 ITERATIONS = 12  # of Newton's method, at most
-FREE = 4  # of them that seek contacts at their ends and may swing a line in full
-SEARCHES = (*range(1, FREE + 1), 7, 10)  # iterations after which contacts are sought anew: the others stay on planes
-# that were found, or else some would go to and fro between two sets of contacts that lead to each other
-SWING = 0.5  # rad, that an iteration may swing a line by
-LATER, LESS = 0.3, 0.7  # part of it after the free ones, and what each further one may of the one before
-SWINGS = (*[1.0] * FREE, *(LATER * LESS**k for k in range(ITERATIONS - FREE)))
+SEARCHES = range(1, 9)  # iterations after which contacts are sought anew: the last ones stay on the planes that were
+# found, or else some would go to and fro between two sets of contacts that lead to each other
+SWING, LESS = 0.5, 0.7  # rad, that an iteration may swing a line by, and what each further one may of the one before:
+# without, one in three goes to and fro between the ends of a swing, whose stretch throws it back
+SWINGS = tuple(LESS**k for k in range(ITERATIONS))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
 ON_GPU = 4  # worlds of a batch for each place where steps are repeated
