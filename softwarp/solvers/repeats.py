@@ -25,7 +25,7 @@ ITERATIONS = 12  # of Newton's method, at most
 SEARCHES = range(1, 9)  # iterations after which contacts are sought anew: the last ones stay on the planes that were
 # found, or else some would go to and fro between two sets of contacts that lead to each other
 SWING, LESS = 0.5, 0.7  # rad, that an iteration may swing a line by, and what each further one may of the one before:
-# without, one in three goes to and fro between the ends of a swing, whose stretch throws it back
+# without, some go to and fro between the ends of a swing, whose stretch throws them back
 SWINGS = tuple(LESS**k for k in range(ITERATIONS))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
