@@ -21,15 +21,15 @@ from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.options import Options
 from softwarp.solvers.system import System
 
-ITERATIONS = 12  # of Newton's method, at most
-SEARCHES = range(1, 9)  # iterations after which contacts are sought anew: the last ones stay on the planes that were
+ITERATIONS = 16  # of Newton's method, at most
+SEARCHES = range(1, 13)  # iterations after which contacts are sought anew: the last ones stay on the planes that were
 # found, or else some would go to and fro between two sets of contacts that lead to each other
-SWING, LESS = 0.5, 0.7  # rad, that an iteration may swing a line by, and what each further one may of the one before:
+SWING, LESS = 0.5, 0.75  # rad, that an iteration may swing a line by, and what each further one may of the one before:
 # without, some go to and fro between the ends of a swing, whose stretch throws them back
 SWINGS = tuple(LESS**k for k in range(ITERATIONS))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
-ON_GPU = 4  # worlds of a batch for each place where steps are repeated
+ON_GPU = 8  # worlds of a batch for each place where steps are repeated
 
 
 class RepeatingEuler:
