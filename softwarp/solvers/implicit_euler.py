@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import warp as wp
@@ -22,8 +22,7 @@ class ImplicitEuler:
     asked after every iterate, which makes the host wait for it, and no graph can hold it. Unless it ``tells``, worlds
     whose iterations end above their tolerance say nothing of it. ``swings`` are the parts of ``Options.most_swing``
     that iterations may swing lines by, the last one for all that follow; without any, they are free. A ``brief`` step
-    ends when all its worlds have converged; its control must hold their contacts. Contacts are sought at the start and
-    for the iterates of ``searches``, counted from 1; others keep the planes that were found, and none of them ends.
+    ends when all its worlds have converged; its control must hold their contacts.
 
     With one Newton iteration this is the linearly implicit scheme of SOFA's EulerImplicitSolver followed by its
     constraint correction; with more, the nonlinear equations are solved to ``Options.newton_tolerance``.
@@ -42,7 +41,6 @@ class ImplicitEuler:
         tells: bool = True,
         swings: Sequence[float] = (),
         brief: bool = False,
-        searches: Collection[int] | None = None,
     ) -> None:
         self.system = system
         self.h = h
@@ -53,7 +51,6 @@ class ImplicitEuler:
         self.control = (control or NewtonControl(system)) if self.iterations > 1 else None
         self.judged = judged
         self.swings, self.brief = swings, brief
-        self.searches = range(1, self.iterations + 1) if searches is None else searches
         self.tells = tells and self.control is not None
 
     @property
@@ -115,15 +112,13 @@ class ImplicitEuler:
             system.move(h)
             system.measure_rows()
             system.row_laws()
-        seeks = iteration == 0 or iteration in self.searches
-        if seeks:
-            system.find_contacts(h, moving=moving, look=self.pace.look)
+        system.find_contacts(h, moving=moving, look=self.pace.look)
         control.hold_still()
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=moving)
         system.imbalance(h, inertia=True)
-        control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h, final=seeks)
+        control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
         control.keep(last=iteration == self.iterations)
         if self.brief:
             control.look_for_others()

@@ -52,18 +52,17 @@ class NewtonControl:
         self.shard.each_real(self.kernels.begin, None, [], [self.system.work.control.real])
         self.multiplier.copy_from(self.system.work.multiplier)
 
-    def judge(self, *, first: bool, tolerance: float, f_scale: float, final: bool = True) -> None:
+    def judge(self, *, first: bool, tolerance: float, f_scale: float) -> None:
         """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``.
 
-        Forces that are not finite at the first one raise a flag, because no step could mend them. Without ``final`` no
-        world has converged.
+        Forces that are not finite at the first one raise a flag, because no step could mend them.
         """
         s, w, m = self.shard, self.system.work, self.system.model
         if first:
             s.check_finite(w.norm, 2)
         self.system.rows.measure_gaps()
         inputs = [first, tolerance, self.rounding, self.rounding_force * f_scale]
-        inputs += [m.segment_count == 0, final, self.system.rows.count]
+        inputs += [m.segment_count == 0, self.system.rows.count]
         inputs += [m.row_size, w.norm.real, w.gap.real]
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
         s.each_real(self.kernels.judge, None, inputs, [w.control.real])

@@ -21,12 +21,11 @@ from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.options import Options
 from softwarp.solvers.system import System
 
-ITERATIONS = 16  # of Newton's method, at most
-SEARCHES = range(1, 13)  # iterations after which contacts are sought anew: the last ones stay on the planes that were
-# found, or else some would go to and fro between two sets of contacts that lead to each other
-SWING, LESS = 0.5, 0.75  # rad, that an iteration may swing a line by, and what each further one may of the one before:
-# without, some go to and fro between the ends of a swing, whose stretch throws them back
-SWINGS = tuple(LESS**k for k in range(ITERATIONS))
+ITERATIONS = 20  # of Newton's method, at most
+SWING = 0.5  # rad, that an iteration may swing a line by
+FREE, LESS = 8, 0.7  # iterations that may do so in full, and what each further one may of the one before: some end in
+# two sets of contacts that lead to each other
+SWINGS = (*[1.0] * FREE, *(LESS**k for k in range(1, ITERATIONS - FREE + 1)))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
 ON_GPU = 8  # worlds of a batch for each place where steps are repeated
@@ -55,8 +54,7 @@ class RepeatingEuler:
         options = twin_options(system.options, system.model.precision)
         self.twin = System(model, system.index, system.variant, here[0], here[1], here[2], options)
         self.control = NewtonControl(self.twin, still=True)
-        newton: dict[str, Any] = {"control": self.control, "tells": False, "brief": True}
-        self.newton = ImplicitEuler(self.twin, h, swings=SWINGS, searches=SEARCHES, **newton)
+        self.newton = ImplicitEuler(self.twin, h, control=self.control, tells=False, swings=SWINGS, brief=True)
         state = {name: getattr(s.state, name) for name in declarations(State)}
         self.state = {name: array for name, array in state.items() if array.shape[1]}
         self.start = {name: allocate(worlds, a.shape[1], a.dtype, s.device) for name, a in self.state.items()}

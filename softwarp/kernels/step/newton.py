@@ -51,7 +51,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rounding: real,
         rounding_force: real,
         monotone: bool,
-        final: bool,
         row_count: int,
         # Model
         row_size: wp.array(dtype=real),
@@ -75,7 +74,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
         search is not ``monotone`` patience never ends.
         A world whose last solve failed has not converged: it stands where it did, and forces balance at a saddle too.
-        None has unless that is ``final``: contacts are not those at the iterate.
         """
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
@@ -113,7 +111,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     improved = True
                 control_out[pack, wp.static(STALL), lane] = stall
                 is_still = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
-                if final and was_solved and (merit <= tolerance or is_still):
+                if was_solved and (merit <= tolerance or is_still):
                     control_out[pack, wp.static(FROZEN), lane] = real(1.0)
                 elif monotone and stall == real(wp.static(PATIENCE)):
                     returning = True

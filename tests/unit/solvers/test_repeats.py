@@ -20,7 +20,7 @@ def scene(worlds: int, *, device: str = "cpu", path: str = "scalar", swing: floa
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     tube = sw.Tube([sw.TubeSection(0.1)], radius=1e-3, youngs=1e8)
     line = builder.add_telescope([tube], segments=8, lengths=(0.08,), contact_radius=2e-4, rayleigh=(0.0, 0.02))
-    builder.add_contact(line, builder.add_rigid(sw.Sphere(0.005), kinematic=True, pose=(0.0075, 0.0007, 0.07)))
+    builder.add_contact(line, builder.add_rigid(sw.Sphere(0.005), kinematic=True, pose=(0.0075, 0.001, 0.07)))
     model = builder.finalize(worlds, device)
     path = path if device == "cpu" else "auto"
     return sw.Simulation(model, dt=0.01, solver_path=path, threads=1, repeat_swing=swing)  # type: ignore[arg-type]
