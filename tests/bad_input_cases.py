@@ -586,9 +586,9 @@ def rightly_accepted(name: str, good: dict[str, Any]) -> dict[str, set[str]]:
     accepted |= {"mesh": {"text", "empty text"}} if "mesh_scale" in good else {}  # a file's name, read later
     accepted |= {"min_tension": {"-inf", "-1", "-1.5"}, "success_height": {"-1"}, "sensors": {"empty"}}
     if name == "ConcentricTubeRobot":  # whose vessel may be a file's name, read later, and whose force has no limit
-        accepted |= {"vessel": {"text", "empty text"}, "force_limit": {"inf"}}
+        accepted |= {"vessel": {"text", "empty text"}, "force_limit": {"inf"}, "max_insertion_force": {"inf"}}
     if name == "CatheterBeam":  # whose force has no limit, and which does not start nested
-        accepted |= {"force_limit": {"inf"}, "nested": set()}
+        accepted |= {"force_limit": {"inf"}, "max_insertion_force": {"inf"}, "nested": set()}
     if name == "Diamond":  # whose cables may have no limits
         accepted |= {"min_displacement": {"-inf", "-1", "-1.5"}, "max_displacement": {"inf"}}
     if name == "Maze":  # whose angles count from the flat state, outwards negative, and whose servos may have no limits

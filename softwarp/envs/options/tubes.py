@@ -40,6 +40,7 @@ class TubesConfig(EnvConfig):
     force_limit: HighLimit = math.inf  # N, sum of wall forces that costs nothing
     force_penalty: NotNegative = 0.0  # taken from the reward of an action per N above the limit
     end_on_force: bool = False  # terminate where the sum of wall forces exceeds the limit
+    max_insertion_force: HighLimit = math.inf  # N, with which the wall may press tubes back before their feed slips
     reward: str = "shaped"  # "shaped" or "paper"
     progress_scale: Length = 0.005  # m of progress worth 1
     precision_scale: Length = 0.002  # m at which precision is worth half its weight
@@ -56,6 +57,9 @@ class TubesConfig(EnvConfig):
         name = type(self).__name__
         if not self.force_limit > 0.0:
             raise ValueError(f"{name}: force_limit must be positive, inf for none, got {self.force_limit!r} N")
+        if not self.max_insertion_force > 0.0:
+            told = f"got {self.max_insertion_force!r} N"
+            raise ValueError(f"{name}: max_insertion_force must be positive, inf for any, {told}")
         if self.force_scale <= 0.0:
             raise ValueError(f"{name}: force_scale must be positive, got {self.force_scale!r} N")
         if math.isinf(self.force_limit) and self.force_penalty > 0.0:

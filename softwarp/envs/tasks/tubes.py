@@ -9,11 +9,14 @@ Reward       shaped: progress (d_prev - d) / progress_scale;  precision w / (1 +
              effort -effort_weight mean(a^2);  force -force_penalty (largest force in the action - force_limit)
              paper:  min(3 sqrt(max((d_best - d) / d_best, 0)), 1) with the episode's least distance so far, d_best
 
-Commands move in equal parts over the sub-steps of an action, and are clamped to what lengths can be.
+Commands move in equal parts over the sub-steps of an action, and are clamped to what lengths can be. With
+``max_insertion_force`` nothing is inserted in sub-steps in which the wall presses the tubes back with more, along the
+axis of their port; they may turn and withdraw.
 """
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
@@ -119,11 +122,20 @@ class TubeTask(SoftEnv):
             torch.sub(self.angle, self._start[1], out=self._change[1])
         else:
             torch.fmax(self.force, self.wall_force(), out=self.force)
+        if math.isfinite(self.config.max_insertion_force):
+            self._slip()
         if substep == self.action_repeat - 1:
             self._tell(self.length, self.angle)
         else:
             length, angle = self._start + (substep + 1) / self.action_repeat * self._change
             self._tell(length, angle)
+
+    def _slip(self) -> None:
+        """Where the wall presses back too hard, the feed slips for a sub-step: what it would insert is taken back."""
+        slips = self.insertion_force() > self.config.max_insertion_force
+        lost = slips[:, None] * self._change[0].clamp_min(0.0) / self.action_repeat
+        self._start[0] -= lost
+        self.length -= lost
 
     def _tell(self, length: Tensor, angle: Tensor) -> None:
         self.sim.control.tube_length.copy_(length)
@@ -192,6 +204,11 @@ class TubeTask(SoftEnv):
         last = self.sim.rod_x[:, self._nodes][:, -2:].to(torch.float32)
         way = last[:, 1] - last[:, 0]
         return way / sums.length_of(way)[:, None].clamp_min(1.0e-9)
+
+    def insertion_force(self) -> Tensor:
+        """Force with which the wall presses the tubes back along the axis of their port now [N], (world,)."""
+        back = -self.sim.contact_load[..., 2].to(torch.float32)  # tubes are the first part of every pair here
+        return sums.total(back.masked_fill(self.sim.contact_pair < 0, 0.0))
 
     def wall_force(self) -> Tensor:
         """Sum of the sizes of all forces on the wall now [N], (world,)."""

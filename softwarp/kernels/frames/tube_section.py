@@ -144,15 +144,16 @@ def functions(variant: Variant) -> SimpleNamespace:
         factor = materials.factor[pack, tube, lane]
         kx = factor * tubes.section_curvature[3 * part]
         ky = factor * tubes.section_curvature[3 * part + 1]
-        c = wp.cos(psi)
-        d = wp.sin(psi)
         found = Part()
         found.bending = e * tubes.area[4 * tube + 2]
         found.torsion = g * tubes.area[4 * tube + 3]
         found.shear = g * tubes.area[4 * tube + 1]
         found.axial = e * tubes.area[4 * tube]
-        found.x = c * kx - d * ky
-        found.y = d * kx + c * ky
+        if kx != real(0.0) or ky != real(0.0):  # most of a wire is straight
+            c = wp.cos(psi)
+            d = wp.sin(psi)
+            found.x = c * kx - d * ky
+            found.y = d * kx + c * ky
         found.twist = factor * tubes.section_curvature[3 * part + 2] - change
         return found
 

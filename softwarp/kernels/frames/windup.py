@@ -93,8 +93,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         moment: vec2,
         twist: real,
         yields: bool,
+        has_turned: bool,
     ):
-        """Equations of one segment of a telescope: bending ``moment`` [N m] of loads, ``twist`` of its frames [1/m]."""
+        """Equations of one segment of a telescope: bending ``moment`` [N m] of loads, ``twist`` of its frames [1/m].
+
+        ``has_turned`` unless ``windup`` still holds the angles of ``before``.
+        """
         e = Equations()
         first = tubes.first_tube[item]
         count = tubes.first_tube[item + 1] - first
@@ -110,13 +114,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             part = stop - s
             mid = s + real(0.5) * part
             t = mid / piece - real(place)
-            mean = mean_at(tubes, materials, length, windup, pack, lane, item, carrier, line, place, mid)
-            if not yields:
-                mean = mean_at(tubes, materials, length, before, pack, lane, item, carrier, line, place, mid)
-            kx = mean.k[0] + moment[0] / mean.bending
-            ky = mean.k[1] + moment[1] / mean.bending
             x = vec4()
             y = vec4()
+            torsion = vec4()
+            own_twist = vec4()
+            bending = real(0.0)
+            kx = real(0.0)
+            ky = real(0.0)
             for k in range(count):
                 reach = shown(length, pack, lane, first + k, carrier, line)
                 if reach > mid:
@@ -126,23 +130,40 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     own = part_at(tubes, materials, pack, lane, first + k, reach, mid, psi, change)
                     x[k] = own.bending * own.x
                     y[k] = own.bending * own.y
-                    pull = own.torsion * (twist - own.twist) * part / piece
+                    torsion[k] = own.torsion
+                    own_twist[k] = own.twist
+                    bending += own.bending
+                    kx += x[k]
+                    ky += y[k]
+            if has_turned and not yields:
+                mean = mean_at(tubes, materials, length, before, pack, lane, item, carrier, line, place, mid)
+                kx = mean.k[0]
+                ky = mean.k[1]
+            else:
+                kx = kx / bending
+                ky = ky / bending
+            kx += moment[0] / bending
+            ky += moment[1] / bending
+            for k in range(count):
+                if torsion[k] > real(0.0):  # it comes here
+                    pull = torsion[k] * (twist - own_twist[k]) * part / piece
                     push = (kx * y[k] - ky * x[k]) * part
-                    hold = own.torsion * part / (piece * piece)
+                    hold = torsion[k] * part / (piece * piece)
                     lean = kx * x[k] + ky * y[k]
                     if yields:
-                        lean = (moment[0] * x[k] + moment[1] * y[k]) / mean.bending
+                        lean = (moment[0] * x[k] + moment[1] * y[k]) / bending
                     lean = wp.max(lean, real(0.0)) * part
                     e.f[k] = e.f[k] + push * (real(1.0) - t) - pull
                     e.g[k] = e.g[k] + push * t + pull
                     e.low[k, k] = e.low[k, k] + hold + lean * (real(1.0) - t) * (real(1.0) - t)
                     e.high[k, k] = e.high[k, k] + hold + lean * t * t
                     e.between[k, k] = e.between[k, k] + lean * t * (real(1.0) - t) - hold
-            for k in range(count):
+            bound = int(0)  # a line in contact keeps its curvature, which no tube's angle turns
+            if yields:
+                bound = count
+            for k in range(bound):
                 for j in range(k):
-                    weight = wp.max((x[k] * x[j] + y[k] * y[j]) / mean.bending, real(0.0)) * part
-                    if not yields:
-                        weight = real(0.0)
+                    weight = wp.max((x[k] * x[j] + y[k] * y[j]) / bending, real(0.0)) * part
                     for end_of in range(2):  # the Laplacian of one edge
                         a = k
                         b = j
@@ -233,6 +254,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             vec2(load_in[pack, 2 * segment, lane], load_in[pack, 2 * segment + 1, lane]),
             twist_in[pack, segment, lane],
             gives_way(contact_count_in, pack * lanes + lane),
+            True,
         )
         row = wp.static(EQUATION_ROWS) * segment
         for k in range(4):
@@ -291,7 +313,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         piece = line / real(n)
         grain = real(wp.static(GRAIN)) * piece
         systems = wp.static(SYSTEM_ROWS) * (first_piece[item] + item)
-        for _ in range(wp.static(1 if side_by_side else ITERATIONS)):
+        for iteration in range(wp.static(1 if side_by_side else ITERATIONS)):
             diagonal = mat44()
             gradient = vec4()
             for k in range(count):  # springs of what lies behind the port
@@ -323,6 +345,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         moment,
                         twist,
                         yields,
+                        iteration > 0,
                     )
                 store = systems + wp.static(SYSTEM_ROWS) * place
                 diagonal = diagonal + e.low

@@ -134,6 +134,32 @@ def test_the_limit_of_force_costs_and_ends() -> None:
     assert ended.all() and data["contact_force"].isfinite().all()
 
 
+def test_a_feed_that_is_pressed_back_slips() -> None:
+    """Nothing is inserted while the wall presses back with more than the limit; turns and withdrawals go on."""
+    env = make(max_insertion_force=2e-3)
+    env.reset()
+    slipped, above = False, False
+    for _ in range(10):
+        before, commanded = env.sim.tube_length.clone(), env.length.clone()
+        act(env, 0.0, 0.5, 1.0, 0.5, 0.0, 0.5)
+        torch.testing.assert_close(env.sim.tube_length.to(env.length), env.length, atol=1e-6, rtol=0.0)
+        went = env.length[:, GUIDE] - commanded[:, GUIDE]
+        slipped |= bool((went < 0.0249).any())
+        above |= bool((env.insertion_force() > 0.1).any())
+        assert (went >= 0.0).all() and (env.sim.tube_length >= before - 1e-6).all()
+    assert slipped and not above
+    turned = env.angle.clone()
+    act(env, 0.0, 0.5, -1.0, 0.5, 0.0, 0.5)
+    torch.testing.assert_close(env.angle - turned, torch.full_like(turned, 0.3), atol=1e-6, rtol=0.0)
+    free = make()
+    free.reset()
+    for _ in range(2):
+        act(free, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    torch.testing.assert_close(free.length[:, GUIDE], torch.full((2,), 0.05), atol=1e-6, rtol=0.0)
+    with pytest.raises(ValueError, match="max_insertion_force must be positive"):
+        CatheterBeamConfig(max_insertion_force=0.0)
+
+
 @pytest.mark.slow  # two large grids; the goals of an anatomy are in test_vessel_ways, its vessel in test_aorta
 def test_every_world_has_an_anatomy_of_its_own() -> None:
     """The wall is moved so that the drawn vessel stands at the port; goals are that vessel's.
