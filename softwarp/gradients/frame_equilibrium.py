@@ -282,13 +282,16 @@ class FrameWorlds:
     # Gradients
 
     def pull(self, given: Tensors, pose: torch.Tensor, by_pose: torch.Tensor, token: int) -> dict[str, torch.Tensor]:
-        """Gradients by what is given from those by the poses of masters, (world, master, 7), at an equilibrium.
+        """Gradients by what is given from those by the poses of masters at an equilibrium, of many losses at once.
 
         Args:
             given: As of ``start``.
             pose: Of all frames.
-            by_pose: Gradients.
+            by_pose: Gradients, (loss, world, master, 7).
             token: Of the equilibrium.
+
+        Returns:
+            By name, (loss, world, ...).
         """
         if token != self.token:
             self._give(given)
@@ -301,21 +304,27 @@ class FrameWorlds:
             self._fresh = token
         assert self._factor is not None
         by_turn = _by_turn(pose[:, self.masters, 3:], by_pose[..., 3:])
-        y = torch.cat([by_pose[..., :3], by_turn], dim=-1).flatten(1).double().masked_fill(self._held, 0.0)
-        p = -torch.linalg.lu_solve(*self._factor, y[..., None], adjoint=True)[..., 0].masked_fill(self._held, 0.0)
-        begin = 0
-        for view, count in zip(self._p, self._counts, strict=True):
-            packs, _, lanes = view.shape
-            part = p.new_zeros((packs * lanes, p.shape[1]))
-            part[:count] = p[begin : begin + count]
+        y = torch.cat([by_pose[..., :3], by_turn], dim=-1).flatten(2).double().masked_fill(self._held, 0.0)
+        p = -torch.linalg.lu_solve(*self._factor, y.permute(1, 2, 0), adjoint=True).permute(2, 0, 1)
+        p = p.masked_fill(self._held, 0.0)
+        own = {name: self.gradients[name.replace("control.", "command_").replace("params.", "")] for name in given}
+        for view in self._p:
             view.zero_()
-            view[:, self._rows.flatten()] = part.reshape(packs, lanes, -1).permute(0, 2, 1).to(view)
-            begin += count
-        for gradient in self.gradients.values():
-            gradient.zero_()
-        self._multiply_all()
-        named = {n: n.replace("control.", "command_").replace("params.", "") for n in given}
-        return {name: self.gradients[own] / self.h for name, own in named.items()}
+        found: dict[str, list[torch.Tensor]] = {name: [] for name in given}
+        for each in p:
+            begin = 0
+            for view, count in zip(self._p, self._counts, strict=True):
+                packs, _, lanes = view.shape
+                part = p.new_zeros((packs * lanes, p.shape[2]))
+                part[:count] = each[begin : begin + count]
+                view[:, self._rows.flatten()] = part.reshape(packs, lanes, -1).permute(0, 2, 1).to(view)
+                begin += count
+            for gradient in self.gradients.values():
+                gradient.zero_()
+            self._multiply_all()
+            for name, gradient in own.items():
+                found[name].append(gradient / self.h)
+        return {name: torch.stack(parts) for name, parts in found.items()}
 
 
 def _by_world(rows: torch.Tensor) -> torch.Tensor:
@@ -384,7 +393,42 @@ class AtRest(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, by_pose: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
-        pose, *tensors = ctx.saved_tensors
-        given = dict(zip(ctx.names, tensors, strict=True))
-        found = ctx.worlds.pull(given, pose, by_pose, ctx.token)
-        return (None, None, None, *(found[name].clone() for name in ctx.names))
+        return (None, None, None, *_Pull.apply(ctx.worlds, ctx.names, ctx.token, by_pose, *ctx.saved_tensors))
+
+
+class _Pull(torch.autograd.Function):
+    """Gradients by all that was given, of one loss, or of many where torch batches a backward pass."""
+
+    @staticmethod
+    def forward(
+        worlds: FrameWorlds, names: tuple[str, ...], token: int, by_pose: torch.Tensor, *held: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Of one loss."""
+        found = _Pull.of_many(worlds, names, token, by_pose[None], held)
+        return tuple(gradient[0] for gradient in found)
+
+    @staticmethod
+    def of_many(
+        worlds: FrameWorlds, names: tuple[str, ...], token: int, by_pose: torch.Tensor, held: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, ...]:
+        """(loss, world, ...) each."""
+        pose, *tensors = held
+        return tuple(worlds.pull(dict(zip(names, tensors, strict=True)), pose, by_pose, token).values())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
+        """Nothing is kept: there are no second derivatives."""
+
+    @staticmethod
+    def vmap(
+        info: Any,
+        in_dims: tuple[Any, ...],
+        worlds: FrameWorlds,
+        names: tuple[str, ...],
+        token: int,
+        by_pose: torch.Tensor,
+        *held: torch.Tensor,
+    ) -> tuple[tuple[torch.Tensor, ...], tuple[int, ...]]:
+        """Of many losses at the same poses."""
+        found = _Pull.of_many(worlds, names, token, by_pose.movedim(in_dims[3], 0), held)
+        return found, (0,) * len(found)

@@ -168,6 +168,7 @@ class _Problem:
         self.weight = np.ones(int(used.sum())) if deviation is None else 1.0 / deviation[used]
         self._known: tuple[bytes, FloatArray, FloatArray] | None = None  # place, those around it, their residuals
         self._last: tuple[bytes, FloatArray] | None = None
+        self._derived: tuple[bytes, FloatArray] | None = None  # place, derivatives there
 
     def require_freedom(self) -> None:
         """Refuse more parameters than measurements."""
@@ -249,11 +250,13 @@ class _Problem:
 
     def derivative(self, u: FloatArray) -> FloatArray:
         """Derivatives of all residuals by places, shape (measurement, parameter), from what is known where it is."""
-        self._at(u)
-        assert self._last is not None
-        if self._known is not None and self._known[0] == u.tobytes():
-            return self.candidates.derivative(u, self._last[1], self._known[1], self._known[2])
-        return self.candidates.derivative(u, self._last[1])
+        key = u.tobytes()
+        if self._derived is None or self._derived[0] != key:
+            self._at(u)
+            assert self._last is not None
+            around = self._known[1:] if self._known is not None and self._known[0] == key else ()
+            self._derived = key, self.candidates.derivative(u, self._last[1], *around)
+        return self._derived[1]
 
     def _weighted(self, u: FloatArray) -> FloatArray:
         return np.asarray(self.derivative(u)[self.used] * self.weight[:, None])
