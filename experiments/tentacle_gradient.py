@@ -112,4 +112,4 @@ def residuals(markers: Markers, target: Floats) -> Differentiable:
         target: Measured markers [mm], (pose, marker, 3).
     """
     told = torch.as_tensor(target).flatten(1)
-    return Differentiable(lambda values: markers(values) - told, experiments=len(target))
+    return Differentiable(lambda values: markers(values) - told, experiments=len(target), batched=True)

@@ -306,8 +306,7 @@ class Simulation(
     def step(self, count: int = 1) -> None:
         """Advance every world by ``dt``, in place, or by several steps under the same commands.
 
-        Several steps at once take less time than one after the other, above all in small scenes on a CPU: each thread
-        takes its worlds through all of them. ``status`` then tells the worst of these steps.
+        Several steps at once take less time, above all in small scenes on a CPU. ``status`` tells the worst of them.
 
         Args:
             count: Number of steps, at least 1.
@@ -321,6 +320,12 @@ class Simulation(
 
     def _advance(self, count: int, is_captured: bool) -> None:
         """Take steps with the present room for contacts."""
+        if count > 1 and not self._is_compiled and not is_captured and interop.records(self.device):
+            self._advance(1, is_captured=False)  # compiles, so that all others can be a recording
+            first = self._views["status"].clone()
+            self._advance(count - 1, is_captured=False)
+            self._views["status"].copy_(interop.worst_of([first, self._views["status"]]))
+            return
         if self._is_compiled and self._graphs is None and not is_captured and interop.records(self.device):
             self._capture()
         if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
@@ -352,10 +357,9 @@ class Simulation(
 
     def _replay(self, graphs: Sequence[Any], count: int) -> None:
         """Replay the graphs of the shards, on a CPU side by side and then that of the outputs, which is the last."""
-        shards = range(len(self._systems))
 
         def run(turn: int) -> None:
-            for shard in shards[turn :: self._turns]:
+            for shard in range(turn, len(self._systems), self._turns):
                 self._repeat(shard, partial(wp.capture_launch, graphs[shard]), count)
 
         try:
@@ -364,7 +368,7 @@ class Simulation(
             else:
                 self._workers.run(run, range(self._turns), helping=count == 1)  # a single launch, which nothing cuts
         finally:  # also on an interrupt
-            if len(graphs) > len(shards):
+            if len(graphs) > len(self._systems):
                 wp.capture_launch(graphs[-1])
             else:
                 self._update_outputs()

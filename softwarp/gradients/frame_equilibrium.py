@@ -93,11 +93,16 @@ class FrameWorlds:
         self.masters = torch.as_tensor(masters, device=device).long()
         self._rows = torch.as_tensor(rows, device=device).long()  # (master, 6)
         self._held = torch.as_tensor(~is_free[masters].ravel(), device=device)
+        self._some_held = not is_free[masters].all()
         self._groups = []
         for group in groups_of(masters.tolist(), near):
             pairs = [(place[a], place[int(b)]) for a in group for b in np.flatnonzero(near[a]) if int(b) in place]
             numbers = torch.tensor([place[frame] for frame in group], device=device)
             self._groups.append((numbers, *torch.tensor(pairs, device=device).T))
+        places = [self._rows[group, axis] for group, _, _ in self._groups for axis in range(6)]
+        self._ones = self._p[0].new_zeros((len(places), self._p[0].shape[1], 1))  # p of every product
+        for ones, rows_of_one in zip(self._ones, places, strict=True):
+            ones[rows_of_one] = 1.0
 
     def start(self, given: Tensors, *, warm: bool) -> None:
         """Take over what the simulation has, and what is given by names as ``control.cable_tension``.
@@ -197,7 +202,8 @@ class FrameWorlds:
                 self.state["frame_pose"].copy_(pose)
                 self._forces()
                 self._factorise(is_fresh)
-            way = torch.where(is_fresh[:, None], self._correction(r), after)
+                after = torch.where(is_fresh[:, None], self._correction(r), after)
+            way = after
         self.state["frame_pose"].copy_(pose)
         return arrived
 
@@ -221,14 +227,13 @@ class FrameWorlds:
 
     def _factorise(self, worlds: torch.Tensor) -> None:
         """Factors of the tangent where some worlds are; needs ``_forces``."""
-        factors = torch.linalg.lu_factor_ex(self._tangent())[:2]  # one that is singular has endless corrections
-        if self._factor is None:
-            self._factor = factors
-        else:
-            masks = worlds[:, None, None], worlds[:, None]
-            self._factor = tuple(  # type: ignore[assignment]
-                torch.where(mask, new, old) for mask, new, old in zip(masks, factors, self._factor, strict=True)
-            )
+        R = self._tangent()
+        if self._factor is None or worlds.all():
+            self._factor = torch.linalg.lu_factor_ex(R)[:2]  # one that is singular has endless corrections
+            return
+        chosen = worlds.nonzero()[:, 0]
+        for held, new in zip(self._factor, torch.linalg.lu_factor_ex(R[chosen])[:2], strict=True):
+            held[chosen] = new
 
     def _tangent(self) -> torch.Tensor:
         """R by places and turns of masters, (world, 6 master, 6 master)."""
@@ -236,22 +241,21 @@ class FrameWorlds:
         worlds = self.model.num_worlds
         R = torch.zeros((worlds, count, 6, count, 6), dtype=torch.float64, device=self.masters.device)
         bars = []
-        for group, _, _ in self._groups:
-            for axis in range(6):
-                for p in self._p:
-                    p.zero_()
-                    p.index_fill_(1, self._rows[group, axis], 1.0)
-                self._multiply()
-                bars.append(self.gradients["frame_pose"].index_select(1, self.masters))
+        for number in range(6 * len(self._groups)):
+            for p in self._p:
+                p.copy_(self._ones[number])
+            self._multiply()
+            bars.append(self.gradients["frame_pose"].index_select(1, self.masters))
         found = torch.stack(bars).double() / self.h
         turns = by_turn(self.state["frame_pose"][:, self.masters, 3:].double(), found[..., 3:])
         found = torch.cat([found[..., :3], turns], dim=-1).reshape(-1, 6, worlds, count, 6)
         for (_, forces, places), held in zip(self._groups, found, strict=True):
             R[:, forces, :, places] = held[:, :, places].permute(2, 1, 0, 3)
         R = R.reshape(worlds, 6 * count, 6 * count)
-        R[:, self._held] = 0.0
-        R[:, :, self._held] = 0.0
-        R[:, self._held, self._held] = 1.0
+        if self._some_held:
+            R[:, self._held] = 0.0
+            R[:, :, self._held] = 0.0
+            R[:, self._held, self._held] = 1.0
         return R
 
     def _move(self, pose: torch.Tensor, way: torch.Tensor, worlds: torch.Tensor) -> None:
@@ -282,13 +286,16 @@ class FrameWorlds:
     # Gradients
 
     def pull(self, given: Tensors, pose: torch.Tensor, by_pose: torch.Tensor, token: int) -> dict[str, torch.Tensor]:
-        """Gradients by what is given from those by the poses of masters, (world, master, 7), at an equilibrium.
+        """Gradients by what is given from those by the poses of masters at an equilibrium, of many losses at once.
 
         Args:
             given: As of ``start``.
             pose: Of all frames.
-            by_pose: Gradients.
+            by_pose: Gradients, (loss, world, master, 7).
             token: Of the equilibrium.
+
+        Returns:
+            By name, (loss, world, ...).
         """
         if token != self.token:
             self._give(given)
@@ -301,21 +308,31 @@ class FrameWorlds:
             self._fresh = token
         assert self._factor is not None
         turns = by_turn(pose[:, self.masters, 3:], by_pose[..., 3:])
-        y = torch.cat([by_pose[..., :3], turns], dim=-1).flatten(1).double().masked_fill(self._held, 0.0)
-        p = -torch.linalg.lu_solve(*self._factor, y[..., None], adjoint=True)[..., 0].masked_fill(self._held, 0.0)
-        begin = 0
-        for view, count in zip(self._p, self._counts, strict=True):
-            packs, _, lanes = view.shape
-            part = p.new_zeros((packs * lanes, p.shape[1]))
-            part[:count] = p[begin : begin + count]
+        y = torch.cat([by_pose[..., :3], turns], dim=-1).flatten(2).double().masked_fill(self._held, 0.0)
+        p = -torch.linalg.lu_solve(*self._factor, y.permute(1, 2, 0), adjoint=True).permute(2, 0, 1)
+        p = p.masked_fill(self._held, 0.0)
+        own = {name: self.gradients[name.replace("control.", "command_").replace("params.", "")] for name in given}
+        found: dict[str, list[torch.Tensor]] = {name: [] for name in given}
+        placed, gradients, rows = self._placed(p), list(self.gradients.values()), self._rows.flatten()
+        for view in self._p:
             view.zero_()
-            view[:, self._rows.flatten()] = part.reshape(packs, lanes, -1).permute(0, 2, 1).to(view)
-            begin += count
-        for gradient in self.gradients.values():
-            gradient.zero_()
-        self._multiply_all()
-        named = {n: n.replace("control.", "command_").replace("params.", "") for n in given}
-        return {name: self.gradients[own] / self.h for name, own in named.items()}
+        for number in range(len(p)):
+            for view, each in zip(self._p, placed, strict=True):
+                view[:, rows] = each[number]
+            torch._foreach_zero_(gradients)
+            self._multiply_all()
+            for name, gradient in own.items():
+                found[name].append(gradient / self.h)
+        return {name: torch.stack(parts) for name, parts in found.items()}
+
+    def _placed(self, p: torch.Tensor) -> list[torch.Tensor]:
+        """Vectors (loss, world, row of masters) as each system has them, (loss, pack, row, lane)."""
+        found = []
+        for view, part in zip(self._p, p.split(self._counts, dim=1), strict=True):
+            packs, _, lanes = view.shape
+            full = torch.nn.functional.pad(part, (0, 0, 0, packs * lanes - part.shape[1]))
+            found.append(full.unflatten(1, (packs, lanes)).transpose(2, 3).to(view))
+        return found
 
 
 def _by_world(rows: torch.Tensor) -> torch.Tensor:
@@ -384,7 +401,42 @@ class AtRest(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, by_pose: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
-        pose, *tensors = ctx.saved_tensors
-        given = dict(zip(ctx.names, tensors, strict=True))
-        found = ctx.worlds.pull(given, pose, by_pose, ctx.token)
-        return (None, None, None, *(found[name].clone() for name in ctx.names))
+        return (None, None, None, *_Pull.apply(ctx.worlds, ctx.names, ctx.token, by_pose, *ctx.saved_tensors))
+
+
+class _Pull(torch.autograd.Function):
+    """Gradients by all that was given, of one loss, or of many where torch batches a backward pass."""
+
+    @staticmethod
+    def forward(
+        worlds: FrameWorlds, names: tuple[str, ...], token: int, by_pose: torch.Tensor, *held: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Of one loss."""
+        found = _Pull.of_many(worlds, names, token, by_pose[None], held)
+        return tuple(gradient[0] for gradient in found)
+
+    @staticmethod
+    def of_many(
+        worlds: FrameWorlds, names: tuple[str, ...], token: int, by_pose: torch.Tensor, held: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, ...]:
+        """(loss, world, ...) each."""
+        pose, *tensors = held
+        return tuple(worlds.pull(dict(zip(names, tensors, strict=True)), pose, by_pose, token).values())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
+        """Nothing is kept: there are no second derivatives."""
+
+    @staticmethod
+    def vmap(
+        info: Any,
+        in_dims: tuple[Any, ...],
+        worlds: FrameWorlds,
+        names: tuple[str, ...],
+        token: int,
+        by_pose: torch.Tensor,
+        *held: torch.Tensor,
+    ) -> tuple[tuple[torch.Tensor, ...], tuple[int, ...]]:
+        """Of many losses at the same poses."""
+        found = _Pull.of_many(worlds, names, token, by_pose.movedim(in_dims[3], 0), held)
+        return found, (0,) * len(found)

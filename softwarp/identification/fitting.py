@@ -168,7 +168,7 @@ class _Problem:
         self.weight = np.ones(int(used.sum())) if deviation is None else 1.0 / deviation[used]
         self._known: tuple[bytes, FloatArray, FloatArray] | None = None  # place, those around it, their residuals
         self._last: tuple[bytes, FloatArray] | None = None
-        self._slope: tuple[bytes, FloatArray] | None = None  # place, and derivatives that are known there
+        self._derived: tuple[bytes, FloatArray] | None = None  # place, derivatives there
 
     def require_freedom(self) -> None:
         """Refuse more parameters than measurements."""
@@ -277,7 +277,7 @@ class _Problem:
             J = J + np.outer(full - centre - J @ way, way) / float(way @ way)
             u, r, centre = place, after, full
         self._last = (u.tobytes(), centre)
-        self._slope = (u.tobytes(), J)
+        self._derived = u.tobytes(), J
         is_at_bound = (u <= 0.0) | (u >= 1.0)
         return SimpleNamespace(x=u, status=status, active_mask=is_at_bound.astype(int)), centre
 
@@ -310,13 +310,13 @@ class _Problem:
 
     def derivative(self, u: FloatArray) -> FloatArray:
         """Derivatives of all residuals by places, shape (measurement, parameter), from what is known where it is."""
-        if self._slope is not None and self._slope[0] == u.tobytes():
-            return self._slope[1]
-        self._at(u)
-        assert self._last is not None
-        if self._known is not None and self._known[0] == u.tobytes():
-            return self.candidates.derivative(u, self._last[1], self._known[1], self._known[2])
-        return self.candidates.derivative(u, self._last[1])
+        key = u.tobytes()
+        if self._derived is None or self._derived[0] != key:
+            self._at(u)
+            assert self._last is not None
+            around = self._known[1:] if self._known is not None and self._known[0] == key else ()
+            self._derived = key, self.candidates.derivative(u, self._last[1], *around)
+        return self._derived[1]
 
     def _weighted(self, u: FloatArray) -> FloatArray:
         return np.asarray(self.derivative(u)[self.used] * self.weight[:, None])

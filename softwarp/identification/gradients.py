@@ -34,10 +34,13 @@ class Differentiable:
             measurement, (experiment, ...). What it tells of an experiment may depend on that row alone, as what a world
             does depends on its own parameters.
         experiments: Rows.
+        batched: Have torch take the backward passes of a Jacobian together (``torch.vmap``), as it can where all
+            of the model is its own functions and equilibria of rods and rigid bodies.
     """
 
-    def __init__(self, model: Callable[[Tensor], Tensor], experiments: int = 1) -> None:
+    def __init__(self, model: Callable[[Tensor], Tensor], experiments: int = 1, *, batched: bool = False) -> None:
         self.model, self.experiments = model, checks.count(experiments, "Differentiable: experiments")
+        self.batched = checks.flag(batched, "Differentiable: batched")
         self._last: tuple[bytes, Tensor, Tensor] | None = None  # values, the leaf made of them, what the model said
         self._size = 0  # of a candidate's residuals
 
@@ -79,9 +82,13 @@ class Differentiable:
         import torch
 
         leaf, out = self._at(values)
-        columns = out.reshape(self.experiments, -1)
-        rows = [torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in columns.sum(dim=0)]
-        return np.asarray(torch.stack(rows, dim=1).reshape(-1, leaf.shape[1]).cpu().numpy())
+        columns = out.reshape(self.experiments, -1).sum(dim=0)
+        if self.batched:
+            each = torch.eye(len(columns), dtype=columns.dtype, device=columns.device)
+            rows = torch.vmap(lambda by: torch.autograd.grad(columns, leaf, by, retain_graph=True)[0])(each)
+        else:
+            rows = torch.stack([torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in columns])
+        return np.asarray(rows.transpose(0, 1).reshape(-1, leaf.shape[1]).cpu().numpy())
 
     def pull(self, values: FloatArray, by: FloatArray) -> FloatArray:
         """Gradient of a loss at one candidate.

@@ -77,7 +77,10 @@ class FrameTangent(StepAdjoint):
 
 
 def neighbours_of(model: Model) -> NDArray[np.bool_]:
-    """Whether the forces on a frame depend on where another one is, (frame, frame): by segments and cables."""
+    """Whether the forces on a frame depend on where another one is, (frame, frame): by segments and cables.
+
+    The force of a cable on a point depends on the points before and behind it, which do not feel each other.
+    """
     frames = model.frames
     assert frames is not None
     near = np.eye(frames.count, dtype=bool)
@@ -87,10 +90,10 @@ def neighbours_of(model: Model) -> NDArray[np.bool_]:
     node, weight = model.point_node.numpy().reshape(-1, 4), model.point_weight.numpy().reshape(-1, 4)
     for begin, end in itertools.pairwise(start):
         held = [carrier[node[k][(weight[k] != 0.0) & (node[k] >= 0)]] for k in range(begin, end)]
-        for k in range(len(held)):
-            around = np.unique(np.concatenate(held[max(k - 1, 0) : k + 2]))
-            around = around[around >= 0]
-            near[np.ix_(around, around)] = True
+        held = [frame[frame >= 0] for frame in held]
+        for k, pulled in enumerate(held):
+            around = np.concatenate(held[max(k - 1, 0) : k + 2])
+            near[np.ix_(pulled, around)] = near[np.ix_(around, pulled)] = True
     return near
 
 

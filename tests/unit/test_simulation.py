@@ -20,10 +20,11 @@ def make(worlds, threads):
 
 @pytest.mark.parametrize(("worlds", "threads"), [(1, 1), (40, 1), (40, 2)])
 def test_several_steps_are_single_steps(worlds, threads):
-    """From the first call on, which compiles, over the second, which captures."""
+    """From the first call on, whose first step compiles and whose second one is captured."""
     several, single = make(worlds, threads), make(worlds, threads)
     for count in (3, 5, 1, 4):
         several.step(count)
+        assert several._graphs is not None
         for _ in range(count):
             single.step()
         assert torch.equal(several.frame_pose, single.frame_pose)

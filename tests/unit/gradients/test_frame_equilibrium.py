@@ -122,6 +122,22 @@ def test_worlds_change_no_bit() -> None:
             assert torch.equal(value[0], found[name][world]), name
 
 
+def test_many_losses_at_once() -> None:
+    """A backward pass that torch batches has the gradients of each loss, by everything that was given."""
+    sim = hanging(2)
+    equilibrium = Equilibrium(sim)
+    leaves = {name: value.clone().requires_grad_() for name, value in given(sim, [1, 2]).items()}
+    tips = solve(equilibrium, leaves).marker_x.flatten(1).sum(dim=0)
+
+    def pull(by: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return torch.autograd.grad(tips, list(leaves.values()), by, retain_graph=True)
+
+    each = torch.eye(len(tips), dtype=tips.dtype)
+    for name, together, *alone in zip(leaves, torch.vmap(pull)(each), *map(pull, each), strict=True):
+        for row, value in zip(together, alone, strict=True):
+            assert torch.allclose(row, value, rtol=1e-10, atol=1e-12 * float(value.abs().max())), name
+
+
 def test_a_warm_start_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses and gradients of earlier equilibria, too, after others have been found; without steps to lead there."""
     sim = hanging()

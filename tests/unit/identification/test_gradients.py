@@ -95,6 +95,28 @@ def test_descent_with_noise_bounds_and_held_out_measurements() -> None:
         assert fits[1].held_out_rmse > 0.0
 
 
+def test_derivatives_are_taken_once_and_many_measurements_at_a_time() -> None:
+    """A batched Jacobian is that of single backward passes; the search's last one serves for the intervals."""
+
+    def curve(values: torch.Tensor) -> torch.Tensor:
+        return values[:, :1] * torch.exp(values[:, 1:] * X) - 2.0 * torch.exp(-X)
+
+    one, many = Differentiable(curve), Differentiable(curve, batched=True)
+    place = np.array([1.5, -0.7])
+    for model in (one, many):
+        model(place[None])
+    np.testing.assert_allclose(many.jacobian(place), one.jacobian(place), rtol=1e-14)
+    places = []
+
+    def told(values: np.ndarray) -> np.ndarray:
+        places.append(values.tobytes())
+        return many.jacobian(values)
+
+    parameters = [Parameter("size", 0.1, 10.0), Parameter("rate", -5.0, 5.0)]
+    assert fit(parameters, many, jacobian=told).values == pytest.approx({"size": 2.0, "rate": -1.0}, rel=1e-5)
+    assert len(places) == len(set(places))
+
+
 @pytest.mark.parametrize(("count", "method"), [(64, "least_squares"), (65, "gradient")])
 def test_many_measurements_are_fitted_along_gradients(count: int, method: str) -> None:
     """Where no method is given, up to 64 of an experiment have a Jacobian, as a backward pass for each is not many."""
