@@ -40,7 +40,7 @@ SHARED = 32 * 1024  # bytes of a block up to which nobody doubts that there is r
 
 LONG = {
     *("collision.surface_phase", "elements.quadratic", "frames.gyration", "frames.inertia", "frames.momentum"),
-    *("elements.turning", "frames.windup", "rows.touch_adjoint"),
+    *("elements.turning", "frames.windup", "rows.touch_adjoint", "rows.touch_directional"),
     *("inverse.laws", "inverse.program", "inverse.settling"),
 }
 

@@ -46,8 +46,9 @@ def test_torch_is_there_and_nothing_has_begun(tmp_path):
     assert forked.run(["-m", "softwarp", "trian"], tmp_path).returncode == 2
 
 
+@pytest.mark.slow
 def test_what_takes_too_long_is_ended(tmp_path):
-    """And the next command runs."""
+    """And the next command runs; in a new process, which has loaded all packages by then."""
     forked.run(["-c", ""], tmp_path)
     began = time.monotonic()
     with pytest.raises(subprocess.TimeoutExpired):
