@@ -90,7 +90,7 @@ def test_tentacle_by_gradient(monkeypatch):
 
 @pytest.mark.slow
 def test_beam_by_gradient():
-    """Residuals are those of worlds that are simulated without gradients; the optimum of an evolution, 13.964 of it."""
+    """Residuals are those of worlds simulated without gradients; the optimum is an evolution's, RMS 0.8366."""
     case = real_beam.Case()
     values = np.array([[2.5e5, -0.005, 0.22, 0.022]])
     found = case.differentiable()(values)[0]
@@ -98,9 +98,10 @@ def test_beam_by_gradient():
     np.testing.assert_allclose(found, case._residuals(plain), rtol=0, atol=0.05)  # of what measurements may be off
     fit = case.fit(method="gradient")
     assert fit.converged
-    assert fit.values["youngs"] == pytest.approx(249.5e3, rel=1e-3)
-    assert fit.values["ratio"] == pytest.approx(0.2229, abs=1e-3)
-    assert fit.values["time"] == pytest.approx(21.7e-3, rel=0.01)
+    assert fit.values["youngs"] == pytest.approx(249.6e3, rel=1e-3)
+    assert fit.values["ratio"] == pytest.approx(0.2241, abs=1e-3)
+    assert fit.values["time"] == pytest.approx(22.4e-3, rel=0.01)
+    assert fit.rmse < 1.005 * 0.8366
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ SIZES = {
         "joint_damping": 1e-5,
         "gravity": 1e-3,
         "youngs": 50.0,
-        "nu": 1e-5,
+        "nu": 1e-4,  # at a tenth of it rounding is a millionth of the smallest slopes
         "density": 1e-2,
         "rayleigh_stiffness": 1e-6,
     },
