@@ -19,3 +19,11 @@ def test_length_is_the_norm():
     """Of vectors along the last axis."""
     vector = torch.randn(4, 6, 3, dtype=torch.float64)
     torch.testing.assert_close(sums.length_of(vector), torch.linalg.vector_norm(vector, dim=-1), rtol=1e-14, atol=0.0)
+
+
+def test_length_of_nothing_has_no_gradient():
+    """Other rows keep theirs."""
+    vector = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]], requires_grad=True)
+    sums.length_of(vector).sum().backward()
+    assert vector.grad is not None
+    assert vector.grad.tolist() == [[0.0, 0.0, 0.0], pytest.approx([0.6, 0.0, 0.8])]
