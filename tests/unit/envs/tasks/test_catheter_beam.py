@@ -156,6 +156,10 @@ def test_a_feed_that_is_pressed_back_slips() -> None:
     for _ in range(2):
         act(free, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     torch.testing.assert_close(free.length[:, GUIDE], torch.full((2,), 0.05), atol=1e-6, rtol=0.0)
+    for way, count in ((1.0, 8), (-1.0, 1)):  # friction presses back what is pushed, and holds back what is pulled
+        for _ in range(count):
+            act(free, way, 0.0, way, 0.0, way, 0.0)
+        assert (way * free.insertion_force() > 1e-5).all()
     with pytest.raises(ValueError, match="max_insertion_force must be positive"):
         CatheterBeamConfig(max_insertion_force=0.0)
 
