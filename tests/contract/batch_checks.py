@@ -60,3 +60,46 @@ class Play:
         other.restore(one, [1])
         self.run(other, [7, 3, 9], steps, start=steps)
         assert_same(first, self.state(other), [3], [1])
+
+    def check_poisoned(
+        self,
+        options: dict[str, Any],
+        poison: Callable[[sw.Simulation], object],
+        steps: int,
+        kept: tuple[str, ...],
+        finite: tuple[str, ...] = (),
+    ) -> None:
+        """World 1 of nine takes a NaN: it says so and keeps its last good state; the others keep their bits."""
+        identity = list(range(9))
+        sims = [self.build(9, options) for _ in range(2)]
+        for sim in sims:
+            self.characterise(sim, identity)
+            self.run(sim, identity, steps)
+        before = self.state(sims[0])
+        poison(sims[0])
+        for sim in sims:
+            sim.step()
+        others = [0, *range(2, 9)]
+        now = self.state(sims[0])
+        assert_same(now, self.state(sims[1]), others, others)
+        assert int(now["status"][1]) == sw.Status.NONFINITE
+        for name in kept:
+            assert torch.equal(now[name][1], before[name][1]), name
+        for name in finite:
+            assert bool(torch.isfinite(now[name]).all()), name
+
+    def check_reset(self, options: dict[str, Any], precision: str, device: str, steps: int) -> None:
+        """Worlds that are reset start over, to the bit; the others do not notice."""
+        identity = [0, 1, 2, 3]
+        sims = [self.build(4, options, precision, device) for _ in range(2)]
+        for sim in sims:
+            self.characterise(sim, identity)
+            self.run(sim, identity, steps)
+        sims[0].reset(torch.tensor([False, True, False, True], device=sims[0].status.device))
+        self.run(sims[0], identity, steps)  # worlds 1 and 3 go through all steps again
+        fresh = self.build(4, options, precision, device)
+        self.characterise(fresh, identity)
+        self.run(fresh, identity, steps)
+        assert_same(self.state(fresh), self.state(sims[0]), [1, 3], [1, 3])
+        self.run(sims[1], identity, steps)
+        assert_same(self.state(sims[1]), self.state(sims[0]), [0, 2], [0, 2])

@@ -158,20 +158,7 @@ def test_snapshot_continues_to_the_bit(options: dict[str, Any], precision: str, 
 @each_path
 def test_reset_touches_masked_worlds_only(options: dict[str, Any], precision: str, device: str) -> None:
     """Worlds that are reset start over, to the bit; the others do not notice."""
-    identity = [0, 1, 2, 3]
-    sims = [build(4, options, precision, device) for _ in range(2)]
-    for sim in sims:
-        characterise(sim, identity)
-        run(sim, identity, 10)
-    mask = torch.tensor([False, True, False, True], device=sims[0].status.device)
-    sims[0].reset(mask)
-    run(sims[0], identity, 10)  # worlds 1 and 3 go through steps 0 to 9 again
-    fresh = build(4, options, precision, device)
-    characterise(fresh, identity)
-    run(fresh, identity, 10)
-    assert_same(state(fresh), {**state(sims[0])}, [1, 3], [1, 3])
-    run(sims[1], identity, 10)
-    assert_same(state(sims[1]), state(sims[0]), [0, 2], [0, 2])
+    PLAY.check_reset(options, precision, device, 10)
 
 
 POISON = {
@@ -197,23 +184,9 @@ POISON = {
 )
 def test_failed_world_is_rolled_back_and_isolated(path: str, iterations: int, poison: str) -> None:
     """A world with a NaN reports NONFINITE and keeps its last good state; its neighbours keep their bits."""
-    identity = list(range(9))
     options = {"solver_path": path, "newton_iterations": iterations}
-    sims = [build(9, options) for _ in range(2)]
-    for sim in sims:
-        characterise(sim, identity)
-        run(sim, identity, 8)
-    before = state(sims[0])
-    POISON[poison](sims[0])
-    for sim in sims:
-        sim.step()
-    others = [0, *range(2, 9)]
-    assert_same(state(sims[0]), state(sims[1]), others, others)
-    now = state(sims[0])
-    assert int(now["status"][1]) == sw.Status.NONFINITE
-    for name in ("node_x", "frame_pose", "frame_twist", "time"):
-        assert torch.equal(now[name][1], before[name][1]), name
-    assert bool(torch.isfinite(now["frame_pose"]).all())
+    kept = ("node_x", "frame_pose", "frame_twist", "time")
+    PLAY.check_poisoned(options, POISON[poison], 8, kept, finite=("frame_pose",))
 
 
 @pytest.mark.parametrize("iterations", [1, 4])
