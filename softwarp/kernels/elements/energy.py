@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.elements import strain
 from softwarp.kernels.elements.corotational import GUARD, GUARD_GROWTH
 from softwarp.kernels.elements.laws import LAWS
 
@@ -26,10 +27,9 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
     real = variant.real
     world_fastest = variant.world_fastest
     module = variant.module(f"energy.{law}")
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
     energy_of, stress_of, own = LAWS[law].energy, LAWS[law].stress, LAWS[law].own
-    vector = wp.types.vector(LAWS[law].count, real)
+    f = strain.functions(variant, law)
+    law_parameters, deformation = f.law_parameters, f.deformation
 
     @wp.kernel(module=module, enable_backward=False)
     def evaluate(
@@ -56,25 +56,8 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
             item, w = wp.tid()
         tet = tet_index[item]
         body = tet_body[tet]
-        one = real(1.0)
-        p = vector()
-        if wp.static(own == 0):
-            two = real(2.0)
-            nu = nu_in[w, body]
-            p[0] = youngs_in[w, body] / (two * (one + nu))
-            p[1] = two * p[0] * nu / (one - two * nu)
-        else:
-            for i in range(own):
-                p[i] = law_parameter_in[w, body_law_start[body] + i]
-        a = tet_node[tet, 0] * 3
-        F = mat33()
-        for b in range(3):
-            n = tet_node[tet, b + 1] * 3
-            edge = vec3()
-            for c in range(3):
-                edge[c] = node_x_in[w, n + c] - node_x_in[w, a + c]
-            g = vec3(tet_gradient[tet, 3 * b], tet_gradient[tet, 3 * b + 1], tet_gradient[tet, 3 * b + 2])
-            F += wp.outer(edge, g)
+        p = law_parameters(youngs_in, nu_in, law_parameter_in, body_law_start, w, body)
+        F = deformation(node_x_in, w, tet_node, tet_gradient, tet)
         density = energy_of(F, p)
         J = wp.determinant(F)
         if wp.static(own == 0):
@@ -88,7 +71,7 @@ def kernels(variant: Variant, law: str) -> SimpleNamespace:
             density += real(wp.static(GUARD)) * (p[1] + real(2.0) * p[0]) * square
         energy_out[w, tet] = tet_volume[tet] * density
         J = wp.max(J, real(wp.static(LEAST_J)))
-        s = stress_of(F, p) * wp.transpose(F) * (one / J)
+        s = stress_of(F, p) * wp.transpose(F) * (real(1.0) / J)
         deviator = s - (wp.trace(s) / real(3.0)) * wp.identity(n=3, dtype=real)
         stress_out[w, tet] = wp.sqrt(real(1.5) * wp.ddot(deviator, deviator))
 
