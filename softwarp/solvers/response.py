@@ -34,6 +34,7 @@ from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 FEW_DOFS = 128  # of a world, up to which each looks through all contacts for those that touch it
+FEW_TOUCHES = 512  # likewise where they are mostly nodes of reduced bodies, which a thread for all would sum as well
 
 
 @dataclass(frozen=True)
@@ -291,18 +292,24 @@ class ContactResponse:
         """target += f H' multiplier of the contacts on unknown scalars; 3 entries per dof."""
         if not self.capacity:
             return
-        c, modes = self.contacts, self.subspace
-        inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
+        modes = self.subspace
         if modes is None or modes.forces is None:
-            if self.variant.world_fastest and self.size <= FEW_DOFS:
-                inputs.insert(2, c.idle.real)
-                self._each_real(self.k_force.gather_force, self.size, inputs, [target.real])
-            else:
-                self._each_real(self.k_force.add_force, None, inputs, [target.real])
+            self._push(self.size, self.size <= FEW_DOFS, f_scale, target)
             return
         modes.forces.zero()
-        self._each_real(self.k_force.add_force, None, inputs, [modes.forces.real])
+        dofs = self.size + modes.touches
+        self._push(dofs, dofs <= FEW_TOUCHES, f_scale, modes.forces)
         modes.project(modes.forces, target)
+
+    def _push(self, dofs: int, are_few: bool, f_scale: float, target: Rows) -> None:
+        """The same on dofs, and on nodes that touch something behind them."""
+        c = self.contacts
+        inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
+        if self.variant.world_fastest and are_few:
+            inputs.insert(2, c.idle.real)
+            self._each_real(self.k_force.gather_force, dofs, inputs, [target.real])
+        else:
+            self._each_real(self.k_force.add_force, None, inputs, [target.real])
 
     # Launches
 

@@ -134,13 +134,16 @@ class ContactSides:
             matrix: W, row by row.
         """
         count, order = self.static_rows, self.static_rows + 3 * self.capacity
-        parts = self.parts
-        structure = [self.size, self.path_limit, count, order, parts, self.pack_first.S, self.pack_count.S]
-        structure += [self.path_size.S, self.path.S]
+        found = [self.pack_first.S, self.pack_count.S, self.path_size.S, self.path.S]
+        self._products([self.size, self.path_limit, count, order, self.parts, *found], scale, matrix)
+        if count:
+            parts = min(self.parts, 1 << (count - 1).bit_length())  # a thread without a row would only wait
+            inputs = [self.size, self.path_limit, count, order, parts, *found, self.side.S, y.S, scale]
+            self._each_part(self.k.delassus_rows, parts, inputs, [matrix.S])
+
+    def _products(self, structure: list[Any], scale: float, matrix: Rows) -> None:
         inputs = [*structure, self.place.S, self.side.S, scale]
-        self._each_part(self.k.delassus_contacts, parts, inputs, [matrix.S])
-        inputs = [*structure, self.side.S, y.S, scale]
-        self._each_part(self.k.delassus_rows, parts if count else 0, inputs, [matrix.S])
+        self._each_part(self.k.delassus_contacts, self.parts, inputs, [matrix.S])
 
     def free_gap(self, y: Rows, x_scale: float, gap: Rows) -> None:
         """gap += x_scale Y' y for right-hand side 0 of ``y``."""
@@ -216,12 +219,20 @@ class PanelSides(ContactSides):
 
     def _allocate(self, symbolic: Symbolic) -> None:
         capacity, panel = self.capacity, self.panels.plan.panel
-        self.k, self.k_panel = contact.kernels(self.variant, together=True), contact_panel.kernels(self.variant)
+        self.k, self.k_panel = (
+            contact.kernels(self.variant, together=True),
+            contact_panel.kernels(self.variant, wide=self.is_wide),
+        )
         self.parts = PANEL_PARTS if self.variant.world_fastest else 1
         self.path_limit = longest_path(panel[:, 2], self.slots, panel[:, 1])
         self.side = self._whole(9 * capacity * self.path_limit)
         self.path_size = self._whole(capacity, wp.int32)
         self.path, self.place = (self._whole(capacity * n, wp.int32) for n in (self.path_limit, self.size))
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether contacts of a GPU touch bodies of many modes."""
+        return self.variant.world_fastest and self.touch.first.size > 0
 
     def _whole(self, count: int, dtype: Any = None) -> Rows:
         return rows.allocate_whole(self.variant, self.world_count, max(count, 1), self.device, dtype)
@@ -238,8 +249,30 @@ class PanelSides(ContactSides):
         self._scatter()
         structure = [i[name] for name in ("column", "column_lower", "row_index", "panel")]
         inputs = [self.size, self.path_limit, count, *structure, team, *span, self.place.S, panels.lower]
-        groups = -(-self.capacity // contact_panel.GROUP)
+        groups = -(-self.capacity // self.k_panel.group)
         panels.cooperate(self.k_panel.substitute, inputs, [self.side.S], contact_panel.THREADS, groups)
+
+    def _scatter(self) -> None:
+        if not self.is_wide:
+            super()._scatter()
+            return
+        span = [self.pack_first.S, self.pack_count.S]
+        inputs = [self.size, self.path_limit, self.dof_free, self.touch, *span, self.contacts.dof.S]
+        inputs += [*self._rows()[1:], self.place.S]
+        dim = (self.width, self.capacity, contact_panel.SPREAD)
+        wp.launch(self.k_panel.spread_rows, dim=dim, inputs=inputs, outputs=[self.side.S], device=self.device)
+
+    def _products(self, structure: list[Any], scale: float, matrix: Rows) -> None:
+        """Entries of W between contacts."""
+        if not self.is_wide or self.capacity > contact_panel.NEAR:
+            super()._products(structure, scale, matrix)
+            return
+        count, order = self.static_rows, self.static_rows + 3 * self.capacity
+        inputs = [self.size, self.path_limit, count, order, self.panels.index["column"]]
+        inputs += [self.pack_first.S, self.pack_count.S, self.place.S, self.side.S, scale]
+        dim = (self.width, -(-self.capacity // contact_panel.NEAR_GROUP), contact_panel.THREADS)
+        kernel, block = self.k_panel.delassus_near, contact_panel.THREADS
+        wp.launch(kernel, dim, inputs, [matrix.S], device=self.device, block_dim=block)
 
     def _each(self, kernel: Any, items: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=(self.width, items), inputs=inputs, outputs=outputs, device=self.device)

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import floating, mode_loads, reduction
+from softwarp.kernels.elements import floating, mode_loads, mode_places, reduction
 from softwarp.kernels.rows import touch
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -63,11 +63,14 @@ class Subspace:
         """Velocities of the nodes, behind those of the dofs that they follow from."""
         r, s, f = self.model.reduction, self.shard, self.frames
         if self.touches and r is not None:
-            inputs = [self.model.dof_count, r.touch_listed, r.node_body, r.node_basis, r.body_wide, r.body_stride]
-            inputs += [r.basis, self.wide.S]
+            bodies, items, k = [r.body_wide, r.body_stride, r.basis, self.wide.S], self.touches, self.k
+            inputs = [self.model.dof_count, r.touch_listed, r.node_body, r.node_basis, *bodies]
+            if s.variant.world_fastest:
+                k, items = mode_places.kernels(s.variant), -(-self.touches // mode_places.NODES)
+                inputs = [self.model.dof_count, r.touch_listed, r.touch_basis, r.node_body, *bodies]
             for v in velocities:
                 s.each(self.k.widen_dofs, r.wide_count, [r.wide_mode, r.mode_dof, v.S], [self.wide.S])
-                s.each(self.k.touch_velocities, self.touches, inputs, [v.S])
+                s.each(k.touch_velocities, items, inputs, [v.S])
                 if f is not None:
                     given = [self.model.dof_count, f.touch, f.touch_body, f.block, r.mode_dof, f.radius]
                     given += [s.work.frame_axes.real, s.work.touch_arm.real]

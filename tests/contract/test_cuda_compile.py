@@ -28,6 +28,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "forward": (False, True),
     "varying": (False, True),
     "together": (False, True),
+    "wide": (False, True),
     "own_rows": (1,),
     "own_contacts": (1, 6),
     "near_rows": (0, 104),

@@ -12,6 +12,7 @@ from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import mode_sums
 
 GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
+AHEAD = 4  # nodes whose forces it reads at once
 
 
 @cache
@@ -128,10 +129,23 @@ def _by_bodies(host: Variant) -> SimpleNamespace:
 
 @cache
 def _by_modes(variant: Variant) -> SimpleNamespace:
-    """The same on a GPU: one thread for some modes."""
+    """The same on a GPU: one thread for some modes, whose sums run over nodes in order.
+
+    The warps of a block have the same 32 worlds, so that what one reads of a node is near for the others.
+    """
     S = variant.S
     module = variant.module("mode_loads")
     Row = wp.types.vector(GROUP, S)
+    Forces = wp.types.vector(3 * AHEAD, S)
+    Places = wp.types.vector(AHEAD, wp.int32)
+
+    @wp.func
+    def shared(item: int, w: int, items: int, worlds: int):
+        """Item and world of a thread, such that 32 worlds have all their items before the next 32."""
+        if worlds % 32 != 0:
+            return item, w
+        place = item * worlds + w
+        return place // 32 % items, place // 32 // items * 32 + place % 32
 
     @wp.kernel(module=module, enable_backward=False)
     def add_forces(
@@ -150,20 +164,32 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         wide_force_out: wp.array2d(dtype=S),
     ):
         """Add Phi' f over the nodes of their body to a group of wide modes; most nodes have no force at all."""
-        group, w = wp.tid()
+        item, world = wp.tid()
+        items = wide_body.shape[0] // wp.static(GROUP)
+        group, w = shared(item, world, items, balance_in.shape[0])
         k = wp.static(GROUP) * group
         body = wide_body[k]
         stride = body_stride[body]
+        last = body_node[body + 1]
         s = Row()
-        for p in range(body_node[body], body_node[body + 1]):
-            i = order[p]
-            fx = balance_in[w, 3 * i]
-            fy = balance_in[w, 3 * i + 1]
-            fz = balance_in[w, 3 * i + 2]
-            if fx * fx + fy * fy + fz * fz > S(0.0):
-                at = node_basis[i] + k - body_wide[body]
-                for c in range(wp.static(GROUP)):
-                    s[c] += fx * basis[at + c] + fy * basis[at + c + stride] + fz * basis[at + c + 2 * stride]
+        for p in range(body_node[body], last, wp.static(AHEAD)):
+            f = Forces()
+            at = Places()
+            for n in range(wp.static(AHEAD)):  # unrolled: these loads do not wait for each other
+                if p + n < last:
+                    i = order[p + n]
+                    at[n] = node_basis[i]
+                    f[3 * n] = balance_in[w, 3 * i]
+                    f[3 * n + 1] = balance_in[w, 3 * i + 1]
+                    f[3 * n + 2] = balance_in[w, 3 * i + 2]
+            for n in range(wp.static(AHEAD)):
+                fx = f[3 * n]
+                fy = f[3 * n + 1]
+                fz = f[3 * n + 2]
+                if fx * fx + fy * fy + fz * fz > S(0.0):
+                    row = at[n] + k - body_wide[body]
+                    for c in range(wp.static(GROUP)):
+                        s[c] += fx * basis[row + c] + fy * basis[row + c + stride] + fz * basis[row + c + 2 * stride]
         for c in range(wp.static(GROUP)):
             wide_force_out[w, k + c] += s[c]
 
@@ -183,14 +209,21 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         # Workspace out
         wide_row_out: wp.array2d(dtype=S),
     ):
-        """One wide mode of a row of H, from the gradient by its points."""
-        k, w = wp.tid()
+        """A group of wide modes of a row of H, from the gradient by its points."""
+        item, world = wp.tid()
+        items = wide_row.shape[0] // wp.static(GROUP)
+        group, w = shared(item, world, items, point_gradient_in.shape[0])
+        k = wp.static(GROUP) * group
         row = wide_row[k]
         stride = body_stride[row_body[row]]
         at = row_basis[row] + k - row_wide[row]
-        s = S(0.0)
+        first = 3 * row_point[row]
+        s = Row()
         for p in range(3 * row_points[row]):
-            s += point_gradient_in[w, 3 * row_point[row] + p] * point_basis[at + p * stride]
-        wide_row_out[w, k] = s
+            gradient = point_gradient_in[w, first + p]
+            for c in range(wp.static(GROUP)):
+                s[c] += gradient * point_basis[at + p * stride + c]
+        for c in range(wp.static(GROUP)):
+            wide_row_out[w, k + c] = s[c]
 
     return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)

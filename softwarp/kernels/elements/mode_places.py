@@ -36,9 +36,9 @@ for (int k = 0; k < stride; k += each) {
 }
 for (int n = 0; n < NODES; ++n) {
     if (begin + n >= end) continue;
-    const int row = 3 * wp::index(node, begin + n);
+    const int row = 3 * (PLACE);
     for (int c = 0; c < 3; ++c) {
-        wp::index(x_out, w, row + c) = s[0][n][c] + wp::index(node_rest, begin + n, c);
+        wp::index(x_out, w, row + c) = s[0][n][c] ORIGIN;
         OTHERS
     }
 }
@@ -54,19 +54,21 @@ def _amplitudes(names: list[str], real: str) -> dict[str, str]:
         "OTHERS": "wp::index(v_out, w, row + c) = s[1][n][c];" if len(names) > 1 else "",
         "NODES": str(NODES),
         "REAL": real,
+        "PLACE": "wp::index(node, begin + n)",
+        "ORIGIN": "+ wp::index(node_rest, begin + n, c)",
     }
 
 
-def _source(names: list[str], real: str) -> str:
+def _source(names: list[str], real: str, **words: str) -> str:
     code = _DISPLACE
-    for word, text in _amplitudes(names, real).items():
+    for word, text in (_amplitudes(names, real) | words).items():
         code = code.replace(word, text)
     return code
 
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
-    """``node_positions`` and ``node_states`` of the ``cuda`` variant."""
+    """``node_positions``, ``node_states`` and ``touch_velocities`` of the ``cuda`` variant."""
     S = variant.S
     name = "double" if variant.real is wp.float64 else "float"
     module = variant.module("mode_places")
@@ -104,6 +106,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v_out: wp.array2d(dtype=S),
     ):
         """X + Phi q and Phi v of some nodes of a body."""
+
+    @wp.func_native(_source(["wide_v"], name, PLACE="dof_count + begin + n", ORIGIN=""))
+    def move(
+        begin: int,
+        end: int,
+        stride: int,
+        first: int,
+        w: int,
+        dof_count: int,
+        node_basis: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        wide_v: wp.array2d(dtype=S),
+        x_out: wp.array2d(dtype=S),
+    ):
+        """Phi v of some nodes of a body, behind the dofs."""
 
     @wp.func
     def same_body(node_body: wp.array(dtype=wp.int32), begin: int, end: int):
@@ -172,4 +189,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
             )
             begin = end
 
-    return SimpleNamespace(node_positions=node_positions, node_states=node_states)
+    @wp.kernel(module=module, enable_backward=False)
+    def touch_velocities(
+        dof_count: int,
+        # Model
+        touch_listed: wp.array(dtype=wp.int32),
+        touch_basis: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        # Workspace in
+        wide_v_in: wp.array2d(dtype=S),
+        # Workspace out
+        dof_out: wp.array2d(dtype=S),
+    ):
+        """Velocities of the next nodes that may touch something, behind those of the dofs."""
+        item, w = wp.tid()
+        begin = wp.static(NODES) * item
+        last = wp.min(begin + wp.static(NODES), touch_listed.shape[0])
+        while begin < last:
+            body = node_body[touch_listed[begin]]
+            end = begin + 1
+            while end < last and node_body[touch_listed[end]] == body:
+                end += 1
+            move(begin, end, body_stride[body], body_wide[body], w, dof_count, touch_basis, basis, wide_v_in, dof_out)
+            begin = end
+
+    return SimpleNamespace(node_positions=node_positions, node_states=node_states, touch_velocities=touch_velocities)

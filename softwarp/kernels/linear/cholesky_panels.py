@@ -127,6 +127,13 @@ def shared_memory(real: Any, count: int) -> str:
     return _SHARED.replace("SCALAR", name_of(real)).replace("COUNT", str(count))
 
 
+def named(code: str, values: dict[str, str]) -> str:
+    """Native code with names replaced by what they stand for."""
+    for name, value in values.items():
+        code = code.replace(name, value)
+    return code
+
+
 def name_of(real: Any) -> str:
     """Name of a scalar type in native code."""
     return "double" if real is wp.float64 else "float"

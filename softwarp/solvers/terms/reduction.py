@@ -157,7 +157,7 @@ class ReductionTerm(Term):
         """Entries of rows at modes."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.row_body, m.row_point, m.row_points, m.row_basis, m.row_wide, m.wide_row, m.body_stride]
-        items = int(m.wide_row.size) if s.variant.world_fastest else int(m.row_body.size)
+        items = int(m.wide_row.size) // mode_loads.GROUP if s.variant.world_fastest else int(m.row_body.size)
         gradient = w.point_gradient.S if self.frames is None else self.frames.gradients()
         s.each(self.k.mode_rows, items, [*inputs, m.point_basis, gradient], [w.wide_row.S])
         if self.frames is not None:

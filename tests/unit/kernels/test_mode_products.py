@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.elements import mode_loads, mode_places, samples, tensor_sums
+from softwarp.kernels.elements import mode_loads, mode_places, reduction, samples, tensor_sums
 
 WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
 
@@ -74,27 +74,49 @@ def test_stiffness_on_tensor_cores(modes, device):
     assert (found[:, :7] == 7.0).all()
 
 
-def test_forces_on_modes():
-    """Phi' f of both bodies is added, whatever nodes have no force."""
+@pytest.mark.parametrize("worlds", [3, 64])
+def test_forces_on_modes(worlds):
+    """Phi' f of both bodies is added, whatever nodes have no force; also where warps of a block share worlds."""
     draws, variant = np.random.default_rng(1), lanes.variant("cuda", "float64")
     nodes, body = 9, np.array([0, 1, 1, 0, 1, 0, 0, 1, 1])
     stride = np.array(STRIDES)[body]
     start = np.cumsum(3 * stride) - 3 * stride
     basis = [draws.normal(size=(3, s)) for s in stride]
-    f = draws.normal(size=(WORLDS, nodes, 3)) * (draws.uniform(size=(WORLDS, nodes, 1)) < 0.5)
+    f = draws.normal(size=(worlds, nodes, 3)) * (draws.uniform(size=(worlds, nodes, 1)) < 0.5)
     order = np.argsort(body, kind="stable")
     wide = np.concatenate([[0], np.cumsum(STRIDES)])
     arrays = [np.searchsorted(body[order], [0, 1, 2]), order, start, body, wide[:-1], STRIDES]
     arrays += [np.repeat([0, 1], STRIDES)]
     inputs = [wp.array(a, dtype=wp.int32, device="cpu") for a in arrays]
     inputs += [wp.array(np.concatenate([b.ravel() for b in basis]), dtype=wp.float64, device="cpu")]
-    inputs += [wp.array(f.reshape(WORLDS, -1), dtype=wp.float64, device="cpu")]
-    out = wp.full((WORLDS, int(wide[-1])), 2.0, dtype=wp.float64, device="cpu")
+    inputs += [wp.array(f.reshape(worlds, -1), dtype=wp.float64, device="cpu")]
+    out = wp.full((worlds, int(wide[-1])), 2.0, dtype=wp.float64, device="cpu")
     kernel = mode_loads.kernels(variant).add_forces
-    found = launch(kernel, (int(wide[-1]) // mode_loads.GROUP, WORLDS), inputs, out)
+    found = launch(kernel, (int(wide[-1]) // mode_loads.GROUP, worlds), inputs, out)
     for number, s in enumerate(STRIDES):
         wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize("worlds", [3, 64])
+def test_rows_on_modes(worlds):
+    """Rows of H on the modes of their bodies, from gradients by their points."""
+    draws, variant = np.random.default_rng(3), lanes.variant("cuda", "float64")
+    points, body = np.array([4, 7, 5]), np.array([0, 1, 1])
+    stride = np.array(STRIDES)[body]
+    start, wide = np.cumsum(3 * points * stride) - 3 * points * stride, np.cumsum(stride) - stride
+    basis = [draws.normal(size=(3 * p, s)) for p, s in zip(points, stride, strict=True)]
+    gradient = draws.normal(size=(worlds, 3 * points.sum()))
+    arrays = [body, np.cumsum(points) - points, points, start, wide, np.repeat([0, 1, 2], stride), STRIDES]
+    inputs = [wp.array(a, dtype=wp.int32, device="cpu") for a in arrays]
+    inputs += [wp.array(np.concatenate([b.ravel() for b in basis]), dtype=wp.float64, device="cpu")]
+    inputs += [wp.array(gradient, dtype=wp.float64, device="cpu")]
+    out = wp.zeros((worlds, int(stride.sum())), dtype=wp.float64, device="cpu")
+    kernel = mode_loads.kernels(variant).mode_rows
+    found = launch(kernel, (int(stride.sum()) // mode_loads.GROUP, worlds), inputs, out)
+    for row, b in enumerate(basis):
+        own = gradient[:, 3 * arrays[1][row] :][:, : 3 * points[row]]
+        np.testing.assert_allclose(found[:, wide[row] : wide[row] + stride[row]], own @ b, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -123,3 +145,29 @@ def test_places_of_nodes_of_two_bodies(precision):
                 wanted[:, listed[i]] = own @ basis[i].T + origin[i]
             fine = 1.0e-12 if precision == "float64" else 1.0e-5
             np.testing.assert_allclose(values.numpy(), wanted.reshape(WORLDS, 30), rtol=fine, atol=fine)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_velocities_of_touching_nodes(precision):
+    """Phi v of nodes of two bodies, behind the dofs, as a thread for each node finds it."""
+    draws, real = np.random.default_rng(6), wp.float64 if precision == "float64" else wp.float32
+    body, listed, dofs = np.array([0, 1, 0, 1, 1, 0, 0]), np.array([2, 0, 5, 6, 1, 4, 3]), 2
+    stride = np.array(STRIDES)[body]
+    start = np.cumsum(3 * stride) - 3 * stride
+    wide = [0, STRIDES[0]]
+
+    def numbers(values):
+        return wp.array(np.asarray(values), dtype=wp.int32, device="cpu")
+
+    basis = wp.array(draws.normal(size=3 * stride.sum()), dtype=real, device="cpu")
+    v = wp.array(draws.normal(size=(WORLDS, sum(STRIDES))), dtype=real, device="cpu")
+    common = [numbers(wide), numbers(STRIDES), basis, v]
+    variant, found = lanes.variant("cuda", precision), []
+    cases = [(mode_places, [numbers(start[listed]), numbers(body)], -(-len(listed) // mode_places.NODES))]
+    cases += [(reduction, [numbers(body), numbers(start)], len(listed))]
+    for module, arrays, items in cases:
+        out = wp.full((WORLDS, 3 * (dofs + len(listed))), 5.0, dtype=real, device="cpu")
+        inputs = [dofs, numbers(listed), *arrays, *common]
+        found.append(launch(module.kernels(variant).touch_velocities, (items, WORLDS), inputs, out))
+    assert (found[0][:, : 3 * dofs] == 5.0).all() and (found[0][:, 3 * dofs :] != 5.0).all()
+    np.testing.assert_allclose(*found, rtol=1e-5 if precision == "float32" else 1e-13, atol=1e-6)

@@ -12,7 +12,7 @@ from softwarp.kernels.rows import contact_force, contact_strips
 from softwarp.plan.ordering import analyze
 from softwarp.solvers.collision.contact_list import SLOTS
 from softwarp.solvers.linear import strips
-from softwarp.solvers.sides import longest_path
+from softwarp.solvers.sides import PanelSides, longest_path
 from softwarp.solvers.workspace.rows import Rows
 from tests.response_cases import (
     HALF,
@@ -415,3 +415,25 @@ def test_unknown_unbounded_row_is_named() -> None:
             rows_h=[np.eye(3)],
             unbounded=(1, 3),
         )
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_kernels_for_contacts_on_many_modes(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, precision: str
+) -> None:
+    """Threads that take all three axes, and products from shared memory, run on a CPU: the W that others find."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    state, found = rng.bit_generator.state, []
+    for wide in (False, True):
+        monkeypatch.setattr(PanelSides, "is_wide", wide)
+        rng.bit_generator.state = state
+        case = random_case(rng, "panels", precision, static=2)
+        case.build()
+        found.append(case.response.contact_sides.side.S.numpy())
+        for world in range(case.worlds):
+            expected = case.reference(world)
+            order, used = case.response.order, len(expected)
+            matrix = get(case.response.matrix, world).reshape(order, order)[:used, :used]
+            fine = 1.0e-10 if precision == "float64" else 2.0e-4
+            np.testing.assert_allclose(matrix, expected, atol=fine * np.abs(expected).max())
+    np.testing.assert_array_equal(*found)
