@@ -77,17 +77,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def go_on(
         places: int,
+        few: int,
         # Workspace out
         progress_out: wp.array(dtype=wp.int32),
         left_out: wp.array(dtype=wp.int32),
+        many_out: wp.array(dtype=wp.int32),
     ):
-        """Count worlds that have repeated their step; ``places`` of them are done, 0 begins."""
+        """Count worlds that have repeated their step, and whether more than ``few`` are left.
+
+        ``places`` of them are done, 0 begins.
+        """
         sample = wp.tid()
         done = int(0)
         if places > 0:
             done = progress_out[wp.static(DONE)] + places
         progress_out[wp.static(DONE)] = done
-        left_out[sample] = wp.max(progress_out[wp.static(COUNT)] - done, 0)
+        left = wp.max(progress_out[wp.static(COUNT)] - done, 0)
+        left_out[sample] = left
+        many_out[sample] = wp.where(left > few, 1, 0)
 
     @wp.kernel(module=module, enable_backward=False)
     def spare(
