@@ -14,7 +14,6 @@ import warp as wp
 from softwarp.kernels.collision import geometry, shapes
 
 SAMPLES = 9  # of an edge before it is searched
-STEEPEST = 1.7321  # slope of the distance between samples of which no two differ by more than they are apart
 DOUBTFUL = 0.2  # part of the square of a bound within which slopes are compared anew, as everywhere else
 EARLY = 5  # halvings that ask whether what is left of an edge is near at all
 
@@ -32,6 +31,14 @@ def functions(real: Any) -> SimpleNamespace:
         """Samples of a grid: where they begin, nodes by axis, origin and spacing."""
         nodes = wp.vec3i(scene.target_grid[target, 1], scene.target_grid[target, 2], scene.target_grid[target, 3])
         return scene.target_grid[target, 0], nodes, scene.grid_origin[target], scene.grid_spacing[target]
+
+    @wp.func
+    def most_change(d: vec3):
+        """Largest change of the distance along d, in the axes of the grid.
+
+        No two samples differ by more than they are apart, so its slope along each axis is 1 at most.
+        """
+        return wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2])
 
     @wp.func
     def near_part(
@@ -58,6 +65,7 @@ def functions(real: Any) -> SimpleNamespace:
         k = int(2)
         apart = int(4)
         between = real(0.25)  # the farthest from a sample that a place of the line lies, as a part of it
+        most = most_change(d)
         is_far = lowest - real(0.5) * length - radius > reach
         if length <= real(0.0):
             is_far = lowest - radius > care
@@ -70,7 +78,7 @@ def functions(real: Any) -> SimpleNamespace:
                     lowest = f
                     at = k
                 k += apart
-            is_far = lowest - between * real(STEEPEST) * length - radius > care
+            is_far = lowest - between * most - radius > care
             k = wp.where(apart == 4, 0, wp.where(apart == 8, 1, -1))
             apart = wp.where(apart == 4, 8, 2)
             between *= real(0.5)
@@ -140,6 +148,7 @@ def functions(real: Any) -> SimpleNamespace:
         """
         left = low
         right = high
+        most = most_change(d)
         middle = bound * wp.abs(bound) * length * length
         k = int(0)
         while k < halvings:
@@ -154,7 +163,7 @@ def functions(real: Any) -> SimpleNamespace:
                 slope = wp.dot(n, d) / length
                 falls = slope < bound or (slope == bound and bound > real(0.0))
             k += 1
-            if k <= wp.static(EARLY) and f - real(0.5 * STEEPEST) * (right - left) * length > care:
+            if k <= wp.static(EARLY) and f - real(0.5) * (right - left) * most > care:
                 left = real(-1.0)
                 right = real(-1.0)
                 k = halvings
