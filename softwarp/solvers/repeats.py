@@ -29,8 +29,7 @@ FREE, LESS = 8, 0.7  # iterations that may do so in full, and what each further 
 SWINGS = (*[1.0] * FREE, *(LESS**k for k in range(1, ITERATIONS - FREE + 1)))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
-ON_GPU = 8  # worlds of a batch for each place where steps are repeated
-FEWER = 8  # such places for each one of those that a GPU uses where few worlds are left
+ON_GPU = (4, 8, 64)  # worlds of a batch for each place where steps are repeated
 
 
 class Places:
@@ -91,7 +90,7 @@ class RepeatingEuler:
 
     These few worlds go, some at a time, to places of their own. All other worlds keep what they have, to the bit. Where
     Newton's step fails, the linear one stands; whether it has converged is not told, since linear steps are never
-    asked. A GPU has few places besides many: what takes the time there is the most places, not the most worlds.
+    asked. A GPU has places for few and for more of them, and takes the fewest that are enough, or the most that it has.
 
     Args:
         system: Worlds; ``Options.repeat_swing`` is theirs.
@@ -106,14 +105,14 @@ class RepeatingEuler:
         state = {name: getattr(s.state, name) for name in declarations(State)}
         self.state = {name: array for name, array in state.items() if array.shape[1]}
         self.start = {name: allocate(worlds, a.shape[1], a.dtype, s.device) for name, a in self.state.items()}
-        many = _places(system)
-        self.many = Places(system, many, h, self.state)
-        few = _few_places(system, many)
-        self.few = Places(system, few, h, self.state) if few > 0 else None
+        self.places = [Places(system, count, h, self.state) for count in _places(system)]
+        counts = [places.count for places in self.places]
+        self.fewer = wp.array([*counts[1:], 0], dtype=wp.int32, device=s.device)
         self.again = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self.order = memory.zeros((worlds,), wp.int32, s.device)
         self.progress = memory.zeros((repeats.ROWS,), wp.int32, s.device)
-        self.left, self.is_many = (memory.zeros((1,), wp.int32, s.device) for _ in range(2))
+        self.left = memory.zeros((1,), wp.int32, s.device)
+        self.more = memory.zeros((len(counts),), wp.int32, s.device)
 
     @property
     def always(self) -> bool:
@@ -122,7 +121,7 @@ class RepeatingEuler:
 
     @always.setter
     def always(self, value: bool) -> None:
-        self.system.always = self.many.twin.always = value
+        self.system.always = self.places[0].twin.always = value
 
     def step(self) -> None:
         """Advance by one step."""
@@ -134,10 +133,10 @@ class RepeatingEuler:
             wp.capture_if(self.left, self._keep)
         self.euler.finish()
         if self.always:
-            for _ in range(-(-self.system.world_count // self.many.count)):
-                self._repeat(self.many)
+            for _ in range(-(-self.system.world_count // self.places[0].count)):
+                self._repeat(self.places[0])
         else:
-            wp.capture_while(self.left, self._repeat_next)
+            wp.capture_while(self.left, partial(self._repeat_within, 0))
 
     def _choose(self) -> None:
         """Which worlds repeat the step."""
@@ -156,12 +155,13 @@ class RepeatingEuler:
             kernel = self.k_copy.choose_integers if array.dtype is wp.int32 else self.k_copy.choose
             s.each_real(kernel, s.variant.parts(array.shape[1]), [1, s.lanes, array, self.again], [self.start[name]])
 
-    def _repeat_next(self) -> None:
-        """Where few are left, they need few places."""
-        if self.few is None:
-            self._repeat(self.many)
+    def _repeat_within(self, first: int) -> None:
+        """In the fewest places from the ``first`` ones on that are enough for all that are left."""
+        here, fewer = partial(self._repeat, self.places[first]), first + 1
+        if fewer == len(self.places):
+            here()
         else:
-            wp.capture_if(self.is_many, partial(self._repeat, self.many), partial(self._repeat, self.few))
+            wp.capture_if(self.more[first:fewer], here, partial(self._repeat_within, fewer))
 
     def _repeat(self, places: Places) -> None:
         """As many of them as there are places take the step."""
@@ -169,9 +169,8 @@ class RepeatingEuler:
         self._go_on(places.count)
 
     def _go_on(self, places: int) -> None:
-        few = 0 if self.few is None else self.few.count
-        outputs = [self.progress, self.left, self.is_many]
-        wp.launch(self.k.go_on, dim=1, inputs=[places, few], outputs=outputs, device=self.shard.device)
+        outputs = [self.progress, self.left, self.more]
+        wp.launch(self.k.go_on, dim=1, inputs=[places, self.fewer], outputs=outputs, device=self.shard.device)
 
 
 def repeats_steps(model: Model, options: Options) -> bool:
@@ -198,13 +197,9 @@ def twin_options(options: Options, precision: str) -> Options:
     )
 
 
-def _places(system: System) -> int:
-    """Worlds that repeat a step together: one, or as many as lanes; on a GPU, where time hardly depends on it, many."""
+def _places(system: System) -> list[int]:
+    """Worlds that repeat a step together, the most first: one, or as many as lanes; on a GPU some of each size."""
     if system.variant.world_fastest:
-        return -(-system.world_count // ON_GPU)
-    return LANE_COUNT if system.variant.lanes > 1 else 1
-
-
-def _few_places(system: System, many: int) -> int:
-    """Places for where few worlds are left, beside ``many``; 0 where a CPU takes them one by one, or many are few."""
-    return many // FEWER if system.variant.world_fastest else 0
+        counts = {-(-system.world_count // each) for each in ON_GPU}
+        return sorted(counts, reverse=True)
+    return [LANE_COUNT if system.variant.lanes > 1 else 1]

@@ -77,13 +77,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def go_on(
         places: int,
-        few: int,
+        fewer: wp.array(dtype=wp.int32),
         # Workspace out
         progress_out: wp.array(dtype=wp.int32),
         left_out: wp.array(dtype=wp.int32),
-        many_out: wp.array(dtype=wp.int32),
+        more_out: wp.array(dtype=wp.int32),
     ):
-        """Count worlds that have repeated their step, and whether more than ``few`` are left.
+        """Count worlds that have repeated their step, and whether more are left than there are ``fewer`` places.
 
         ``places`` of them are done, 0 begins.
         """
@@ -94,7 +94,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         progress_out[wp.static(DONE)] = done
         left = wp.max(progress_out[wp.static(COUNT)] - done, 0)
         left_out[sample] = left
-        many_out[sample] = wp.where(left > few, 1, 0)
+        for size in range(fewer.shape[0]):
+            more_out[size] = wp.where(left > fewer[size], 1, 0)
 
     @wp.kernel(module=module, enable_backward=False)
     def spare(

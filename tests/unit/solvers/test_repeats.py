@@ -78,7 +78,7 @@ def test_worlds_that_repeat_side_by_side_keep_their_bits(monkeypatch: pytest.Mon
     """One whose iterations have ended waits for the others, and has then what it has alone, forces of contacts too."""
     forces = (0.03, 0.05, 0.06)
     alone = [scene(1) for _ in forces]
-    monkeypatch.setattr(repeats, "_places", lambda _: len(forces))
+    monkeypatch.setattr(repeats, "_places", lambda _: [len(forces)])
     batch = scene(len(forces))
     contacts = 0
     for world, force in enumerate(forces):
@@ -100,12 +100,11 @@ def test_what_is_left_takes_fewer_places(monkeypatch: pytest.MonkeyPatch, device
     """Six worlds in places for four, then for two: what they come to is what they come to alone."""
     forces = (0.03, 0.04, 0.05, 0.06, 0.05, 0.045)
     alone = [scene(1, device=device) for _ in forces]
-    monkeypatch.setattr(repeats, "_places", lambda _: 4)
-    monkeypatch.setattr(repeats, "_few_places", lambda *_: 2)
+    monkeypatch.setattr(repeats, "_places", lambda _: [4, 2])
     batch, taken = scene(len(forces), device=device), []
     stepper = batch._steppers[0]
-    assert isinstance(stepper, RepeatingEuler) and stepper.few is not None
-    for places in (stepper.many, stepper.few):
+    assert isinstance(stepper, RepeatingEuler)
+    for places in stepper.places:
         step = places.step
         monkeypatch.setattr(places, "step", lambda *a, c=places.count, s=step: (taken.append(c), s(*a)))
     for world, force in enumerate(forces):
