@@ -6,6 +6,7 @@ Theory: docs/theory/telescope.md, "Swings".
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -28,15 +29,68 @@ FREE, LESS = 8, 0.7  # iterations that may do so in full, and what each further 
 SWINGS = (*[1.0] * FREE, *(LESS**k for k in range(1, ITERATIONS - FREE + 1)))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
-ON_GPU = 8  # worlds of a batch for each place where steps are repeated
+ON_GPU = (4, 8, 64)  # worlds of a batch for each place where steps are repeated
+
+
+class Places:
+    """A system with a workspace for some worlds, which brings Newton's method to an end there.
+
+    Args:
+        system: Worlds that may come here.
+        count: Places.
+        h: Length of a step [s].
+        state: Rows of ``State`` that they bring and take, by name.
+    """
+
+    def __init__(self, system: System, count: int, h: float, state: dict[str, wp.array]) -> None:
+        self.count, self.shard, self.state = count, system.shard, state
+        self.k = repeats.kernels(system.variant)
+        model = replace(system.model, num_worlds=count)
+        here = (create(State, model), create(Control, model), create(Parameters, model))
+        options = twin_options(system.options, system.model.precision)
+        self.twin = System(model, system.index, system.variant, here[0], here[1], here[2], options)
+        self.control = NewtonControl(self.twin, still=True)
+        self.newton = ImplicitEuler(self.twin, h, control=self.control, tells=False, swings=SWINGS, brief=True)
+        self.inputs: list[tuple[wp.array, wp.array]] = []
+        for whole, part in ((self.shard.control, here[1]), (self.shard.parameters, here[2])):
+            pairs = [(getattr(whole, name), getattr(part, name)) for name in declarations(whole)]
+            self.inputs += [pair for pair in pairs if pair[0].shape[1]]
+
+    def step(self, start: dict[str, wp.array], progress: wp.array, order: wp.array) -> None:
+        """The next worlds take the step, as many as there are places.
+
+        Args:
+            start: Their rows before it.
+            progress: How many have taken it, and how many will.
+            order: Their numbers.
+        """
+        here = self.twin.state
+        for source, target in [*((start[name], getattr(here, name)) for name in self.state), *self.inputs]:
+            kernel = self.k.take_integers if target.dtype is wp.int32 else self.k.take
+            self._copy(kernel, target.shape[1], [source, progress, order], target)
+        t = self.twin.shard
+        t.each_real(self.k.spare, None, [t.lanes, progress], [self.control.spare.real])
+        self.newton.step()
+        for name, target in self.state.items():
+            if name != "status":
+                kernel = self.k.give_integers if target.dtype is wp.int32 else self.k.give
+                source = getattr(here, name)
+                self._copy(kernel, target.shape[1], [source, here.status, progress, order], target)
+        inputs = [here.status, here.status, progress, order]
+        self._copy(self.k.give_integers, 1, inputs, self.state["status"])
+
+    def _copy(self, kernel: Any, rows: int, inputs: list[Any], target: wp.array) -> None:
+        variant = self.shard.variant
+        dim = variant.dim(self.count, variant.parts(rows))
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[target], device=self.shard.device)
 
 
 class RepeatingEuler:
     """Backward Euler steps of one linearisation, which worlds whose lines it swings too far take again.
 
-    These few worlds go, some at a time, to places of their own: a system with a workspace for that many, which brings
-    Newton's method to an end there. All other worlds keep what they have, to the bit. Where Newton's step fails, the
-    linear one stands; whether it has converged is not told, since linear steps are never asked.
+    These few worlds go, some at a time, to places of their own. All other worlds keep what they have, to the bit. Where
+    Newton's step fails, the linear one stands; whether it has converged is not told, since linear steps are never
+    asked. A GPU has places for few and for more of them, and takes the fewest that are enough, or the most that it has.
 
     Args:
         system: Worlds; ``Options.repeat_swing`` is theirs.
@@ -48,25 +102,17 @@ class RepeatingEuler:
         self.euler = ImplicitEuler(system, h)
         self.k, self.k_copy = repeats.kernels(system.variant), stages.kernels(system.variant)
         s, worlds = self.shard, system.world_count
-        self.places = _places(system)
-        model = replace(system.model, num_worlds=self.places)
-        here = (create(State, model), create(Control, model), create(Parameters, model))
-        options = twin_options(system.options, system.model.precision)
-        self.twin = System(model, system.index, system.variant, here[0], here[1], here[2], options)
-        self.control = NewtonControl(self.twin, still=True)
-        self.newton = ImplicitEuler(self.twin, h, control=self.control, tells=False, swings=SWINGS, brief=True)
         state = {name: getattr(s.state, name) for name in declarations(State)}
         self.state = {name: array for name, array in state.items() if array.shape[1]}
         self.start = {name: allocate(worlds, a.shape[1], a.dtype, s.device) for name, a in self.state.items()}
-        self.held = [(self.start[name], getattr(here[0], name)) for name in self.state]
-        for whole, part in ((s.control, here[1]), (s.parameters, here[2])):
-            pairs = [(getattr(whole, name), getattr(part, name)) for name in declarations(whole)]
-            self.held += [pair for pair in pairs if pair[0].shape[1]]
-        self.found = [(getattr(here[0], name), array) for name, array in self.state.items()]
+        self.places = [Places(system, count, h, self.state) for count in _places(system)]
+        counts = [places.count for places in self.places]
+        self.fewer = wp.array([*counts[1:], 0], dtype=wp.int32, device=s.device)
         self.again = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self.order = memory.zeros((worlds,), wp.int32, s.device)
         self.progress = memory.zeros((repeats.ROWS,), wp.int32, s.device)
         self.left = memory.zeros((1,), wp.int32, s.device)
+        self.more = memory.zeros((len(counts),), wp.int32, s.device)
 
     @property
     def always(self) -> bool:
@@ -75,7 +121,7 @@ class RepeatingEuler:
 
     @always.setter
     def always(self, value: bool) -> None:
-        self.system.always = self.twin.always = value
+        self.system.always = self.places[0].twin.always = value
 
     def step(self) -> None:
         """Advance by one step."""
@@ -87,10 +133,10 @@ class RepeatingEuler:
             wp.capture_if(self.left, self._keep)
         self.euler.finish()
         if self.always:
-            for _ in range(-(-self.system.world_count // self.places)):
-                self._repeat()
+            for _ in range(-(-self.system.world_count // self.places[0].count)):
+                self._repeat(self.places[0])
         else:
-            wp.capture_while(self.left, self._repeat)
+            wp.capture_while(self.left, partial(self._repeat_within, 0))
 
     def _choose(self) -> None:
         """Which worlds repeat the step."""
@@ -109,30 +155,22 @@ class RepeatingEuler:
             kernel = self.k_copy.choose_integers if array.dtype is wp.int32 else self.k_copy.choose
             s.each_real(kernel, s.variant.parts(array.shape[1]), [1, s.lanes, array, self.again], [self.start[name]])
 
-    def _repeat(self) -> None:
-        """As many of them as there are places take the step."""
-        for source, target in self.held:
-            kernel = self.k.take_integers if target.dtype is wp.int32 else self.k.take
-            self._copy(kernel, target.shape[1], [source, self.progress, self.order], target)
-        t = self.twin.shard
-        t.each_real(self.k.spare, None, [t.lanes, self.progress], [self.control.spare.real])
-        self.newton.step()
-        status = self.twin.state.status
-        for source, target in self.found:
-            if source is not status:
-                kernel = self.k.give_integers if target.dtype is wp.int32 else self.k.give
-                self._copy(kernel, target.shape[1], [source, status, self.progress, self.order], target)
-        self._copy(self.k.give_integers, 1, [status, status, self.progress, self.order], self.state["status"])
-        self._go_on(self.places)
+    def _repeat_within(self, first: int) -> None:
+        """In the fewest places from the ``first`` ones on that are enough for all that are left."""
+        here, fewer = partial(self._repeat, self.places[first]), first + 1
+        if fewer == len(self.places):
+            here()
+        else:
+            wp.capture_if(self.more[first:fewer], here, partial(self._repeat_within, fewer))
 
-    def _copy(self, kernel: Any, rows: int, inputs: list[Any], target: wp.array) -> None:
-        variant = self.shard.variant
-        dim = variant.dim(self.places, variant.parts(rows))
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[target], device=self.shard.device)
+    def _repeat(self, places: Places) -> None:
+        """As many of them as there are places take the step."""
+        places.step(self.start, self.progress, self.order)
+        self._go_on(places.count)
 
     def _go_on(self, places: int) -> None:
-        outputs = [self.progress, self.left]
-        wp.launch(self.k.go_on, dim=1, inputs=[places], outputs=outputs, device=self.shard.device)
+        outputs = [self.progress, self.left, self.more]
+        wp.launch(self.k.go_on, dim=1, inputs=[places, self.fewer], outputs=outputs, device=self.shard.device)
 
 
 def repeats_steps(model: Model, options: Options) -> bool:
@@ -159,8 +197,9 @@ def twin_options(options: Options, precision: str) -> Options:
     )
 
 
-def _places(system: System) -> int:
-    """Worlds that repeat a step together: one, or as many as lanes; on a GPU, where time hardly depends on it, many."""
+def _places(system: System) -> list[int]:
+    """Worlds that repeat a step together, the most first: one, or as many as lanes; on a GPU some of each size."""
     if system.variant.world_fastest:
-        return -(-system.world_count // ON_GPU)
-    return LANE_COUNT if system.variant.lanes > 1 else 1
+        counts = {-(-system.world_count // each) for each in ON_GPU}
+        return sorted(counts, reverse=True)
+    return [LANE_COUNT if system.variant.lanes > 1 else 1]

@@ -12,7 +12,7 @@ from functools import partial
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import assembly
+from softwarp.kernels.elements import assembly, norms
 from softwarp.kernels.frames import prescribed
 from softwarp.model.model import Model
 from softwarp.model.resolution import resolved_sizes
@@ -356,7 +356,12 @@ class System:
         inputs = [m.dof_count, m.node_count, m.dof_node, forces]
         inputs += [w.node_mass.S, w.node_external.S, s.input["v0"].S]
         inputs += [w.element_force.S, y.S, f_scale, 1.0 if inertia else 0.0]
-        s.each_world(self.k.force_norms, inputs, [w.norm.S])
+        if self.variant.world_fastest:
+            k = norms.kernels(self.variant)
+            s.each(k.force_squares, norms.PARTS, inputs, [w.norm_part.S])
+            s.each_world(k.force_norms, [w.norm_part.S], [w.norm.S])
+        else:
+            s.each_world(self.k.force_norms, inputs, [w.norm.S])
         for term in self.terms:
             term.norms(f_scale)
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.collision import closest, faces, features, geometry, shapes, shapes_phase
+from softwarp.kernels.collision import closest, faces, features, geometry, shape_touches, shapes
 from softwarp.kernels.collision.closest import INSIDE, SIDE, VERTEX
-from softwarp.kernels.collision.shapes_phase import LEVEL, UNSURE
+from softwarp.kernels.collision.shape_touches import LEVEL, UNSURE
 from softwarp.model.codes import FAR, FLAT, Carrier, CoupleColumn, Target
 
 PLANE, LINE, POINT, RING = range(4)  # forms
@@ -183,7 +183,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     def kink(f: Feature, form: Form, second: Form):
         """An edge whose distance falls at ``low`` and rises at ``high``: the tangents meet between.
 
-        As ``shapes_phase.at_kink``.
+        As ``shape_touches.at_kink``.
         """
         touch = Touch()
         d = f.a1 - f.a0
@@ -211,7 +211,7 @@ def functions(scalar: Any) -> SimpleNamespace:
     def rounded(f: Feature, form: Form):
         """An edge whose distance from one round form falls at ``low`` and rises at ``high``.
 
-        As ``shapes_phase.level_place``.
+        As ``shape_touches.level_place``.
         """
         touch = Touch()
         d = f.a1 - f.a0
@@ -276,8 +276,9 @@ def finders(scalar: Any) -> SimpleNamespace:
     to_local, to_world = shape.to_local, shape.to_world
     point_triangle = closest.functions(real).point_triangle
     corner_x = faces.functions(real).corner_x
-    search = shapes_phase.functions(real)
-    brackets_of, touch_line, is_unsure = search.brackets_of, search.touch_line, search.is_unsure
+    search = shape_touches.functions(real)
+    part_of, brackets_of = search.part_of, search.brackets_of
+    touch_line, is_unsure = search.touch_line, search.is_unsure
     shape_distance = search.shape_distance
     own_types = structures(real)
     Form, Feature, Meeting = own_types.Form, own_types.Feature, own_types.Meeting
@@ -423,7 +424,7 @@ def finders(scalar: Any) -> SimpleNamespace:
 
     @wp.func
     def point_on_shape(scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int):
-        """A point that touches a shape; as ``shapes_phase.touch_point``."""
+        """A point that touches a shape; as ``shape_touches.touch_point``."""
         x = target_x(scene, motion, pack, lane, target)
         q = target_q(scene, motion, pack, lane, target)
         found = Feature()
@@ -439,7 +440,7 @@ def finders(scalar: Any) -> SimpleNamespace:
 
     @wp.func
     def edge_on_shape(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, target: int, side: int):
-        """An edge that touches a shape, with its form before and behind; as ``shapes_phase.touch_edge``."""
+        """An edge that touches a shape, with its form before and behind; as ``shape_touches.touch_edge``."""
         x = target_x(scene, motion, pack, lane, target)
         q = target_q(scene, motion, pack, lane, target)
         found = Feature()
@@ -452,14 +453,18 @@ def finders(scalar: Any) -> SimpleNamespace:
         if kind == wp.static(Target.BOX) or kind == wp.static(Target.CYLINDER):
             near = real(UNSURE) * wp.length(scene.edge_inset[edge])
         none = vec3()
-        brackets = brackets_of(scene, target, x, q, found.a0, d, found.ball, real(FAR))
+        far = real(FAR)
+        low, high = part_of(scene, target, x, q, found.a0, d, found.ball, far, far)
+        brackets = brackets_of(scene, target, x, q, found.a0, d, found.ball, far, far, low, high)
         touch = touch_line(brackets, found.a0, d, none, found.ball, side)
         found.share = touch.share
         found.probe = touch.share
         level = touch.region & wp.static(FLAT)
         if is_unsure(touch, near):
             found.inset = edge_inset(scene, motion, pack, lane, edge)
-            brackets = brackets_of(scene, target, x, q, found.a0 + found.inset, d, found.ball, near)
+            brackets = brackets_of(
+                scene, target, x, q, found.a0 + found.inset, d, found.ball, near, far, real(0.0), real(1.0)
+            )
             other = touch_line(brackets, found.a0, d, found.inset, found.ball, side)
             if (other.region & level) == 0 or wp.length(other.a - touch.a) >= near:
                 found.share = other.share

@@ -59,5 +59,5 @@ def box_halvings(
 ) -> wp.vec2f:
     """Bracket from ``low`` to ``high`` after ``AT_ONCE`` halvings in each of the ``rounds``.
 
-    It closes on the place start + t way where the slope comes to ``bound``, as ``shapes_phase.turn_of`` has it.
+    It closes on the place start + t way where the slope comes to ``bound``, as ``shape_touches.turn_of`` has it.
     """

@@ -5,452 +5,13 @@ On a CPU ``find`` keeps what it has computed of a key within reach, in one of ``
 place: the search of an edge takes microseconds.
 """
 
-from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.collision import features, geometry, shapes, touches
-from softwarp.kernels.collision.halving import AT_ONCE, box_halvings
-from softwarp.model.codes import CORNER, EDGE, FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
-
-BISECTIONS = 4 * AT_ONCE  # halvings of an edge
-LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
-SAMPLES = 9  # of an edge before it is searched in a grid
-STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
-ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
-UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
-
-
-@cache
-def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
-    """Distance of points and edges from shapes, in world coordinates.
-
-    ``at_once`` is for a CPU in single precision: some halvings of an edge together.
-    """
-    real = scalar
-    types = geometry.structures(real)
-    vec3, vec4 = types.vec3, types.vec4
-    Scene, Motion, Touch, Sample, Brackets = types.Scene, types.Motion, types.Touch, types.Sample, types.Brackets
-    place = geometry.functions(real)
-    point_x, turned = place.point_x, place.turned
-    own = features.functions(real)
-    point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
-    shape = shapes.functions(real)
-    to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
-    rotate_back, box_slope, grid_distance = shape.rotate_back, shape.box_slope, shape.grid_distance
-
-    @wp.func
-    def region_of(kind: int, size: vec3, p: vec3, n: vec3):
-        """Which part of a shape is nearest to p, from the normal there: CORNER, EDGE or FACE."""
-        region = int(FACE)
-        if kind == wp.static(Target.CAPSULE):  # capsule: its axis is an edge, the ends of the axis are corners
-            region = int(EDGE)
-            if wp.abs(p[2]) >= real(0.5) * size[1]:
-                region = int(CORNER)
-        elif kind == wp.static(Target.BOX):
-            zeros = int(0)
-            for c in range(3):
-                if wp.abs(n[c]) < real(ALIGNED):
-                    zeros += 1
-            if zeros == 1:
-                region = int(EDGE)
-            elif zeros == 0:
-                region = int(CORNER)
-        elif kind == wp.static(
-            Target.CYLINDER
-        ):  # cylinder: caps are faces, the mantle is an edge (its axis, rounded), rims are corners
-            if wp.abs(n[2]) < real(ALIGNED):
-                region = int(EDGE)
-            elif wp.abs(n[2]) < real(1.0) - real(ALIGNED):
-                region = int(CORNER)
-        return region
-
-    @wp.func
-    def region_within(kind: int, size: vec3, p: vec3, border: real):
-        """FACE where p is close to one face of a box or to a cap only, EDGE or CORNER within ``border`` of several."""
-        near = int(0)
-        if kind == wp.static(Target.BOX):
-            for c in range(3):
-                if wp.abs(p[c]) > real(0.5) * size[c] - border:
-                    near += 1
-        else:
-            if wp.abs(p[2]) > real(0.5) * size[1] - border:
-                near += 1
-            if wp.sqrt(p[0] * p[0] + p[1] * p[1]) > size[0] - border:
-                near += 1
-        region = int(FACE)
-        if near == 2:
-            region = int(EDGE)
-        elif near == 3:
-            region = int(CORNER)
-        return region
-
-    @wp.func
-    def local_distance(scene: Scene, target: int, local: vec3):
-        """Signed distance from a shape, normal and region, in the shape's axes."""
-        kind = scene.target_kind[target]
-        size = scene.target_size[target]
-        d = real(0.0)
-        n = vec3()
-        if kind == wp.static(Target.GRID):
-            nodes = wp.vec3i(scene.target_grid[target, 1], scene.target_grid[target, 2], scene.target_grid[target, 3])
-            d, n = grid(
-                scene.grid_value,
-                scene.target_grid[target, 0],
-                nodes,
-                scene.grid_origin[target],
-                scene.grid_spacing[target],
-                local,
-            )
-        else:
-            d, n = primitive(kind, size, local)
-        return d, n, region_of(kind, size, local, n)
-
-    @wp.func
-    def shape_distance(scene: Scene, target: int, x: vec3, q: vec4, p: vec3):
-        """Signed distance of p from a shape at the pose (x, q), normal in world axes, region."""
-        d, n, region = local_distance(scene, target, to_local(x, q, p))
-        return d, rotate(q, n), region
-
-    @wp.func
-    def touch_point(scene: Scene, motion: Motion, pack: int, lane: int, point: int, target: int, x: vec3, q: vec4):
-        """One point against one shape. Close to boxes and cylinders the normal is that at the inset point."""
-        touch = Touch()
-        a = point_x(scene, motion, pack, lane, point)
-        inset = vec3()
-        kind = scene.target_kind[target]
-        is_rim = scene.point_kind[point] == wp.static(Carrier.RIM)
-        stage = int(0)  # the point or the middle of its rim, the point of the rim, its inset
-        while stage < 3:
-            d, n, region = shape_distance(scene, target, x, q, a + inset)
-            touch.region = region
-            touch.distance = d - wp.dot(n, inset)
-            touch.normal = n
-            if stage == 0 and is_rim:
-                arm = turned(motion, pack, lane, scene.point_index[point], scene.point_axis[point])
-                radius = wp.length(arm)
-                e = around_rim(scene.point_quarter[point], arm / radius, n)
-                a += radius * e
-                stage = 1
-            else:
-                near = real(UNSURE) * wp.length(scene.point_inset[point])
-                if (
-                    stage < 2
-                    and (kind == wp.static(Target.BOX) or kind == wp.static(Target.CYLINDER))
-                    and touch.distance < near
-                ):
-                    inset = point_inset(scene, motion, pack, lane, point, a)
-                    stage = 2
-                else:
-                    stage = 3
-        if wp.dot(inset, inset) > real(0.0) and touch.region == wp.static(FACE):
-            border = real(0.25) * wp.length(inset)
-            touch.region = region_within(kind, scene.target_size[target], to_local(x, q, a), border)
-        touch.a = a
-        touch.b = a - touch.distance * touch.normal
-        touch.distance = touch.distance - scene.point_radius[point]
-        return touch
-
-    @wp.func
-    def at_kink(a: Sample, v: Sample, level: real, length: real):
-        """Where the tangents at a place that falls and one that rises meet, with the normal across edge and kink.
-
-        ``t`` is -1 where the two normals nearly cancel.
-        """
-        best = Sample()
-        best.t = real(-1.0)
-        sa = wp.min(a.slope, -level)
-        sb = wp.max(v.slope, level)
-        mean = (sb * a.n - sa * v.n) / (sb - sa)
-        across = wp.length(mean)
-        if across > real(0.1):
-            best.n = mean / across
-            best.t = (a.f - v.f + (sb * v.t - sa * a.t) * length) / ((sb - sa) * length)
-            best.t = wp.clamp(best.t, a.t, v.t)
-            best.f = wp.min(a.f + sa * (best.t - a.t) * length, wp.min(a.f, v.f)) / across
-            best.region = a.region
-        return best
-
-    @wp.func
-    def lowest_place(
-        a: Sample, b: Sample, u: Sample, v: Sample, falls: bool, rises: bool, side: int, level: real, length: real
-    ):
-        """Where an edge touches for one ``side``, from the brackets a b and u v; ``t`` is -1 where it does not."""
-        best = Sample()
-        best.t = real(-1.0)
-        if u.t - b.t > real(STRETCH):
-            if side == 0 and falls:
-                best = b
-            elif side == 1 and rises:
-                best = u
-            best.region = best.region | wp.static(FLAT)
-        elif side == 0 and falls and rises:
-            best = at_kink(a, v, level, length)
-        return best
-
-    @wp.func
-    def level_place(a: Sample, v: Sample):
-        """Where a line is nearest to an edge or a corner, between a place that falls and one that rises.
-
-        The normal there is across the line; the way from there is the tangent of the angle by which normals turn.
-        """
-        n = wp.normalize(v.slope * a.n - a.slope * v.n)
-        before = wp.dot(a.n, n)
-        behind = wp.dot(v.n, n)
-        t = v.t
-        if before > real(0.0) and behind > real(0.0):
-            from_a = wp.length(wp.cross(a.n, n)) * behind
-            from_v = wp.length(wp.cross(v.n, n)) * before
-            t = wp.clamp(a.t + (v.t - a.t) * from_a / (from_a + from_v), a.t, v.t)
-        return t
-
-    @wp.func
-    def turn_of(scene: Scene, target: int, start: vec3, d: vec3, length: real, low: real, high: real, bound: real):
-        """Bracket of halvings of the place where the slope comes to ``bound``.
-
-        Before, slopes are less than a negative bound, and not greater than a positive one.
-        """
-        if wp.static(at_once):
-            if scene.target_kind[target] == wp.static(Target.BOX):
-                rounds = wp.static(BISECTIONS // AT_ONCE)
-                ends = box_halvings(scene.target_size[target], start, d, length, low, high, bound, rounds)
-                return ends[0], ends[1]
-        left = low
-        right = high
-        halvings = int(0)
-        while halvings < wp.static(BISECTIONS):
-            t = real(0.5) * (left + right)
-            slope = real(0.0)
-            p = start + t * d
-            if scene.target_kind[target] == wp.static(Target.BOX):
-                slope = box_slope(scene.target_size[target], p, d) / length
-            else:
-                _d, n, _region = local_distance(scene, target, p)
-                slope = wp.dot(n, d) / length
-            if slope < bound or (slope == bound and bound > real(0.0)):
-                left = t
-            else:
-                right = t
-            halvings += 1
-        return left, right
-
-    @wp.func
-    def around_lowest(scene: Scene, target: int, start: vec3, d: vec3):
-        """The ends of what lies between the neighbours of the lowest sample of a line, in the axes of a grid."""
-        first = scene.target_grid[target, 0]
-        nodes = wp.vec3i(scene.target_grid[target, 1], scene.target_grid[target, 2], scene.target_grid[target, 3])
-        origin, spacing = scene.grid_origin[target], scene.grid_spacing[target]
-        lowest = real(FAR)
-        at = int(0)
-        for k in range(wp.static(SAMPLES)):
-            t = real(k) / real(SAMPLES - 1)
-            f = grid_distance(scene.grid_value, first, nodes, origin, spacing, start + t * d)
-            if f < lowest:
-                lowest = f
-                at = int(k)
-        return real(at - 1) / real(SAMPLES - 1), real(at + 1) / real(SAMPLES - 1)
-
-    @wp.func
-    def brackets_of(scene: Scene, target: int, x: vec3, q: vec4, start: vec3, d: vec3, radius: real, reach: real):
-        """Where the distance along a line start + t d stops to fall and begins to rise; not at all where it does not.
-
-        The distance of a convex shape is convex along the edge: one bracket closes on the place where it stops to fall,
-        one on that where it begins to rise. Grids are sampled first, and searched around the lowest sample. Between the
-        two, a last look is at where the distance from one round part of a shape is least.
-        """
-        length = wp.length(d)
-        local_start = to_local(x, q, start)
-        local_d = rotate_back(q, d)
-        level = real(LEVEL)
-        end = int(7)  # looks: the middle, both ends; then the brackets: a and b, u and v; the last one
-        low = real(0.0)
-        high = real(1.0)
-        a = Sample()  # still falls
-        b = Sample()  # falls no longer
-        u = Sample()  # does not rise yet
-        v = Sample()  # rises
-        falls = bool(False)
-        rises = bool(False)
-        round_place = Sample()
-        round_place.t = real(-1.0)
-        left = real(0.0)
-        right = real(0.0)
-        t = real(0.5)
-        k = int(0)
-        if length <= real(0.0):
-            k = end + 1
-        while k <= end:
-            here = Sample()
-            here.t = t
-            f, n, region = local_distance(scene, target, local_start + t * local_d)
-            here.f = f
-            here.n = n
-            here.region = region
-            here.slope = wp.dot(n, local_d) / length
-            if k == 0:
-                if here.f - real(0.5) * length - radius > reach:
-                    k = end
-                t = real(0.0)
-                if k == 0 and scene.target_kind[target] == wp.static(Target.GRID):
-                    low, high = around_lowest(scene, target, local_start, local_d)
-                    t = low
-                    if low < real(0.0) or high > real(1.0):
-                        k = end
-            elif k == 1:
-                a = here
-                b = here
-                t = high
-            elif k == 2:
-                u = here
-                v = here
-                falls = a.slope < -level and v.slope >= -level
-                rises = v.slope > level and a.slope <= level
-                if falls:
-                    left, right = turn_of(scene, target, local_start, local_d, length, low, high, -level)
-                    t = left
-                elif rises:
-                    k = 4
-                else:
-                    k = end
-            elif k == 3:
-                a = here
-                t = right
-            elif k == 4:
-                b = here
-                if not rises:
-                    k = end
-            elif k == 5:
-                u = here
-                t = right
-            elif k == 6:
-                v = here
-                t = level_place(a, v)
-                if not falls or a.region != v.region or v.region == wp.static(FACE):
-                    k = end
-            else:
-                round_place = here
-            if k == 4:
-                u = a
-                left, right = turn_of(scene, target, local_start, local_d, length, a.t, high, level)
-                t = left
-            k += 1
-        found = Brackets()
-        found.a = a
-        found.b = b
-        found.u = u
-        found.v = v
-        found.falls = falls
-        found.rises = rises
-        found.lowest = round_place
-        if falls or rises:
-            found.lowest.n = rotate(q, round_place.n)
-            found.a.n = rotate(q, a.n)
-            found.b.n = rotate(q, b.n)
-            found.u.n = rotate(q, u.n)
-            found.v.n = rotate(q, v.n)
-        return found
-
-    @wp.func
-    def touch_line(found: Brackets, p0: vec3, d: vec3, inset: vec3, radius: real, side: int):
-        """An edge p0 + t d, searched along a line moved by ``inset``; face -1 without a minimum between the ends.
-
-        If its brackets are apart the edge runs level between them, and both ends of this part touch, one for each
-        ``side``. If they meet there may be a kink: the normal is across edge and kink.
-        """
-        touch = Touch()
-        touch.distance = real(FAR)
-        best = Sample()
-        best.t = real(-1.0)
-        touch.face = -1
-        if found.falls or found.rises:
-            touch.face = 0
-            best = lowest_place(
-                found.a, found.b, found.u, found.v, found.falls, found.rises, side, real(LEVEL), wp.length(d)
-            )
-            if found.lowest.t >= real(0.0) and side == 0 and found.u.t - found.b.t <= real(STRETCH):
-                best = found.lowest
-        if best.t > real(0.0) and best.t < real(1.0):
-            away = best.f - wp.dot(best.n, inset)
-            touch.distance = away - radius
-            touch.normal = best.n
-            touch.a = p0 + best.t * d
-            touch.b = touch.a - away * best.n
-            touch.share = best.t
-            touch.region = best.region
-        return touch
-
-    @wp.func
-    def is_unsure(touch: Touch, near: real):
-        """Whether an edge is so close that its normal is taken at its inset."""
-        return touch.face >= 0 and near > real(0.0) and (touch.distance <= near or touch.distance > real(FAR_FROM))
-
-    @wp.func
-    def with_inset(touch: Touch, other: Touch, near: real):
-        """The touch of an edge, given that of its inset."""
-        result = other
-        apart = wp.length(other.a - touch.a)
-        if (touch.region & other.region & wp.static(FLAT)) != 0 and apart < near:
-            result.b = other.b + touch.a - other.a  # the place of the true edge, the normal of the inset one
-            result.a = touch.a
-            result.share = touch.share
-        return result
-
-    @wp.func
-    def touch_edge(
-        scene: Scene, motion: Motion, pack: int, lane: int, edge: int, target: int, x: vec3, q: vec4, reach: real
-    ):
-        """Both sides of one edge against one shape; close to boxes and cylinders, normals are those at its inset."""
-        p0 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 0])
-        d = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1]) - p0
-        radius = scene.edge_radius[edge]
-        near = real(0.0)
-        if scene.target_kind[target] == wp.static(Target.BOX) or scene.target_kind[target] == wp.static(
-            Target.CYLINDER
-        ):
-            near = real(UNSURE) * wp.length(scene.edge_inset[edge])
-        found = brackets_of(scene, target, x, q, p0, d, radius, reach)
-        first = touch_line(found, p0, d, vec3(), radius, 0)
-        second = touch_line(found, p0, d, vec3(), radius, 1)
-        is_first = is_unsure(first, near)
-        is_second = is_unsure(second, near)
-        if is_first or is_second:
-            inset = edge_inset(scene, motion, pack, lane, edge)
-            found = brackets_of(scene, target, x, q, p0 + inset, d, radius, near)
-            if is_first:
-                first = with_inset(first, touch_line(found, p0, d, inset, radius, 0), near)
-            if is_second:
-                second = with_inset(second, touch_line(found, p0, d, inset, radius, 1), near)
-        return first, second
-
-    @wp.func
-    def touch_shape(
-        scene: Scene, motion: Motion, pack: int, lane: int, couple: int, key: int, x: vec3, q: vec4, reach: real
-    ):
-        """The feature of a key against its shape, and the other side of it where it is an edge."""
-        touch = Touch()
-        other = Touch()
-        width = scene.couple[couple, wp.static(CoupleColumn.WIDTH)]
-        offset = key - scene.couple[couple, wp.static(CoupleColumn.KEY)]
-        feature = scene.couple[couple, wp.static(CoupleColumn.FIRST)] + offset / width
-        target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
-        if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
-            touch, other = touch_edge(scene, motion, pack, lane, feature, target, x, q, reach)
-            if offset % width == 1:
-                return other, touch
-        else:
-            touch = touch_point(scene, motion, pack, lane, feature, target, x, q)
-        return touch, other
-
-    return SimpleNamespace(
-        touch_shape=touch_shape,
-        shape_distance=shape_distance,
-        brackets_of=brackets_of,
-        touch_line=touch_line,
-        is_unsure=is_unsure,
-    )
+from softwarp.kernels.collision import features, geometry, shape_touches, shapes, touches
+from softwarp.model.codes import FAR, Carrier, CoupleColumn, Target
 
 
 @single_worlds
@@ -462,10 +23,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
     Scene, Motion, Touch, vec3 = types.Scene, types.Motion, types.Touch, types.vec3
     place = geometry.functions(real)
     target_x, target_q, frame_v = place.target_x, place.target_q, place.frame_v
-    touch_shape = functions(real, real is wp.float32 and not variant.world_fastest).touch_shape
+    search = shape_touches.functions(real, real is wp.float32 and not variant.world_fastest)
+    touch_shape, line_of, part_of = search.touch_shape, search.line_of, search.part_of
+    near_part, grid_of = search.near_part, search.grid_of
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
-    rotate = shapes.functions(real).rotate
+    shape = shapes.functions(real)
+    rotate, rotate_back = shape.rotate, shape.rotate_back
     write_touch, keep_touch, kept_touch, urgency = vars(touches.functions(real)).values()
 
     @wp.kernel(module=module, enable_backward=False)
@@ -533,6 +97,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             else:
                 limit += slack
             limit = wp.min(limit, pair_distance_in[pack, pair, lane] + ahead)
+            care = wp.where(h > real(0.0) or waits > real(0.0), reach, limit)  # no hit comes of what lies beyond
+            is_grid = scene.target_kind[target] == wp.static(Target.GRID)
+            samples, nodes, origin, spacing = grid_of(scene, target)
             searched = int(-1)  # the last feature that has a side at all, and what its second one touches
             second = Touch()
             for key in range(chunk_key[chunk], chunk_key[chunk + 1]):
@@ -547,8 +114,35 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     hit = -1
                 elif not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, normal, reach):
                     touch = second
-                    if not is_second:
-                        touch, second = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                    low = real(0.0)
+                    high = real(1.0)
+                    if is_grid and not is_second:  # most are far: that is told without what all others need
+                        start, way, radius = line_of(scene, motion, pack, lane, edges, feature)
+                        length = wp.length(way)
+                        start = rotate_back(q, start - x)
+                        way = rotate_back(q, way)
+                        if edges or scene.point_kind[feature] != wp.static(Carrier.RIM):
+                            low, high = near_part(
+                                scene.grid_value,
+                                samples,
+                                nodes,
+                                origin,
+                                spacing,
+                                start,
+                                way,
+                                length,
+                                radius,
+                                reach,
+                                care,
+                            )
+                    if low < real(0.0):
+                        touch = Touch()
+                        touch.distance = real(FAR)
+                        touch.face = -1
+                    elif not is_second:
+                        touch, second = touch_shape(
+                            scene, motion, pack, lane, couple, key, x, q, reach, care, low, high
+                        )
                     if touch.face >= 0:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:
@@ -593,7 +187,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     x = target_x(scene, motion, pack, lane, target)
                     q = target_q(scene, motion, pack, lane, target)
                     reach = reach_in[pack, couple, lane]
-                    touch, _ = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                    low = real(0.0)
+                    high = real(1.0)
+                    if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
+                        edge = scene.couple[couple, wp.static(CoupleColumn.FIRST)]
+                        edge += (key - scene.couple[couple, wp.static(CoupleColumn.KEY)]) / scene.couple[
+                            couple, wp.static(CoupleColumn.WIDTH)
+                        ]
+                        start, way, radius = line_of(scene, motion, pack, lane, True, edge)
+                        low, high = part_of(scene, target, x, q, start, way, radius, reach, real(FAR))
+                    touch, _ = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach, real(FAR), low, high)
                     write_touch(pack, c, lane, touch, touch_out)
 
     return SimpleNamespace(find=find, measure=measure)

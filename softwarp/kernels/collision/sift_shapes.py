@@ -14,7 +14,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT, variant, vec8
 from softwarp.kernels.collision import geometry
-from softwarp.kernels.collision.shapes_phase import LEVEL
+from softwarp.kernels.collision.shape_touches import LEVEL
 from softwarp.kernels.collision.sift import LANES
 from softwarp.model.codes import CoupleColumn, Target
 

@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import faces, features, geometry, nearest, shapes, touches
-from softwarp.kernels.collision.shapes_phase import UNSURE
+from softwarp.kernels.collision.shape_touches import UNSURE
 from softwarp.kernels.collision.sift import AHEAD, FARTHER, OUTSIDE
 from softwarp.model.codes import BALL_RANKS, CORNER, FAR, URGENCIES, Carrier, CoupleColumn, Target
 

@@ -24,6 +24,71 @@ def kernels(variant: Variant) -> SimpleNamespace:
             square += difference * difference
         return square
 
+    @wp.func
+    def square_of_swing(
+        u: wp.array3d(dtype=real),
+        frame_dof: wp.array(dtype=wp.int32),
+        frame: int,
+        h: real,
+        length: real,
+        pack: int,
+        lane: int,
+    ):
+        """Of the segment behind a frame: by the ways of its ends, or by half of what these turn against each other."""
+        swing = way_between(u, frame_dof[2 * frame], frame_dof[2 * frame + 2], h / length, pack, lane)
+        turn = way_between(u, frame_dof[2 * frame + 1], frame_dof[2 * frame + 3], h, pack, lane)
+        return wp.max(swing, real(0.25) * turn)
+
+    @wp.func
+    def share_within(most_swing: real, largest: real):
+        """Part of the way of a world in which the square of the largest swing is ``largest``."""
+        share = real(1.0)
+        if largest > most_swing * most_swing:
+            share = most_swing / wp.sqrt(largest)
+        return share
+
+    @wp.kernel(module=module, enable_backward=False)
+    def swing_of_segment(
+        h: real,
+        # Model
+        piece_telescope: wp.array(dtype=wp.int32),
+        piece_place: wp.array(dtype=wp.int32),
+        pieces: wp.array(dtype=wp.int32),
+        base_frame: wp.array(dtype=wp.int32),
+        frame_dof: wp.array(dtype=wp.int32),
+        radius: wp.array(dtype=real),
+        # Workspace in
+        plan_in: wp.array3d(dtype=real),
+        u_in: wp.array3d(dtype=real),
+        # Workspace out
+        square_out: wp.array3d(dtype=real),
+    ):
+        """Square of the swing of one segment, as ``share_of_way`` has it; for a GPU, where a world has too many."""
+        pack, segment, lane = wp.tid()
+        item = piece_telescope[segment]
+        n = pieces[item]
+        length = wp.max(plan_in[pack, wp.static(PLAN_ROWS) * item + 1, lane] / real(n), radius[item])
+        frame = base_frame[item] + piece_place[segment]
+        square_out[pack, segment, lane] = square_of_swing(u_in, frame_dof, frame, h, length, pack, lane)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def share_of_segments(
+        most_swing: real,
+        count: int,
+        # Workspace in
+        square_in: wp.array3d(dtype=real),
+        # Workspace out
+        share_out: wp.array3d(dtype=real),
+        swing_out: wp.array3d(dtype=real),
+    ):
+        """What ``share_of_way`` finds, from the squares of all segments."""
+        pack, lane = wp.tid()
+        largest = real(0.0)
+        for segment in range(count):
+            largest = wp.max(largest, square_in[pack, segment, lane])
+        share_out[pack, 0, lane] = share_within(most_swing, largest)
+        swing_out[pack, 0, lane] = wp.sqrt(largest)
+
     @wp.kernel(module=module, enable_backward=False)
     def share_of_way(
         h: real,
@@ -53,13 +118,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             length = wp.max(plan_in[pack, wp.static(PLAN_ROWS) * item + 1, lane] / real(n), radius[item])
             for place in range(n):
                 frame = base_frame[item] + place
-                swing = way_between(u_in, frame_dof[2 * frame], frame_dof[2 * frame + 2], h / length, pack, lane)
-                turn = way_between(u_in, frame_dof[2 * frame + 1], frame_dof[2 * frame + 3], h, pack, lane)
-                largest = wp.max(largest, wp.max(swing, real(0.25) * turn))
-        share = real(1.0)
-        if largest > most_swing * most_swing:
-            share = most_swing / wp.sqrt(largest)
-        share_out[pack, 0, lane] = share
+                largest = wp.max(largest, square_of_swing(u_in, frame_dof, frame, h, length, pack, lane))
+        share_out[pack, 0, lane] = share_within(most_swing, largest)
         swing_out[pack, 0, lane] = wp.sqrt(largest)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -85,4 +145,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if dof_free[dof, c] != real(0.0):
                         u_out[pack, 3 * dof + c, lane] = share * u_out[pack, 3 * dof + c, lane]
 
-    return SimpleNamespace(share_of_way=share_of_way, hold_back=hold_back)
+    return SimpleNamespace(
+        swing_of_segment=swing_of_segment,
+        share_of_segments=share_of_segments,
+        share_of_way=share_of_way,
+        hold_back=hold_back,
+    )

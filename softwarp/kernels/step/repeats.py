@@ -77,17 +77,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def go_on(
         places: int,
+        # Workspace in
+        fewer_in: wp.array(dtype=wp.int32),
         # Workspace out
         progress_out: wp.array(dtype=wp.int32),
         left_out: wp.array(dtype=wp.int32),
+        more_out: wp.array(dtype=wp.int32),
     ):
-        """Count worlds that have repeated their step; ``places`` of them are done, 0 begins."""
+        """Count worlds that have repeated their step, and whether more are left than each fewer places hold.
+
+        ``places`` of them are done, 0 begins.
+        """
         sample = wp.tid()
         done = int(0)
         if places > 0:
             done = progress_out[wp.static(DONE)] + places
         progress_out[wp.static(DONE)] = done
-        left_out[sample] = wp.max(progress_out[wp.static(COUNT)] - done, 0)
+        left = wp.max(progress_out[wp.static(COUNT)] - done, 0)
+        left_out[sample] = left
+        for size in range(fewer_in.shape[0]):
+            more_out[size] = wp.where(left > fewer_in[size], 1, 0)
 
     @wp.kernel(module=module, enable_backward=False)
     def spare(

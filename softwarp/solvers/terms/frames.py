@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.elements import assembly
+from softwarp.kernels.elements import assembly, norms
 from softwarp.kernels.frames import inertia as frame_inertia
 from softwarp.kernels.frames import momentum, motion, prescribed
 from softwarp.model.frames import FrameModel
@@ -116,8 +116,13 @@ class FrameTerm(Term):
     def norms(self, f_scale: float) -> None:
         """Add the size of what should balance at frames."""
         s, w, m = self.shard, self.shard.work, self.model
-        inputs = [m.count, len(m.segment_frames), w.frame_external.S, w.frame_momentum.S]
-        s.each_world(self.k_inertia.frame_norms, [*inputs, w.segment_force.S, f_scale], [w.norm.S])
+        inputs = [m.count, len(m.segment_frames), w.frame_external.S, w.frame_momentum.S, w.segment_force.S, f_scale]
+        if s.variant.world_fastest:
+            k = norms.kernels(s.variant)
+            s.each(k.frame_squares, norms.PARTS, inputs, [w.norm_part.S])
+            s.each_world(k.frame_norms, [w.norm_part.S], [w.norm.S])
+        else:
+            s.each_world(self.k_inertia.frame_norms, inputs, [w.norm.S])
 
     def move(self, x_scale: float) -> None:
         """Trial poses, levers and carried nodes."""

@@ -144,8 +144,14 @@ class TelescopeTerm(Term):
         s, w, m, f, most = self.shard, self.shard.work, self.model, self.frames, part * self.shard.options.most_swing
         if math.isinf(most) and math.isinf(s.options.repeat_swing):
             return
-        inputs = [h, most, m.pieces, m.base_frame, f.frame_dof, self.radius, w.telescope_plan.real, w.u.real]
-        s.each_real(self.k_restraint.share_of_way, None, inputs, [w.share_of_way.real, w.swing.real])
+        k, found = self.k_restraint, [w.share_of_way.real, w.swing.real]
+        inputs = [m.pieces, m.base_frame, f.frame_dof, self.radius, w.telescope_plan.real, w.u.real]
+        if s.variant.world_fastest:
+            inputs = [h, m.piece_telescope, m.piece_place, *inputs]
+            s.each_real(k.swing_of_segment, m.piece_count, inputs, [w.segment_swing.real])
+            s.each_real(k.share_of_segments, None, [most, m.piece_count, w.segment_swing.real], found)
+        else:
+            s.each_real(k.share_of_way, None, [h, most, *inputs], found)
         inputs = [s.model.dof_free, w.share_of_way.real]
         s.each_real(self.k_restraint.hold_back, s.variant.parts(s.model.dof_count), inputs, [w.u.real])
 

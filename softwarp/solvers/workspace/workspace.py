@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import corotational, quadratic, samples, tensor_sums, turning
+from softwarp.kernels.elements import corotational, norms, quadratic, samples, tensor_sums, turning
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.frames.tube_section import LAW_ROWS, PLAN_ROWS
 from softwarp.kernels.frames.windup import SYSTEM_ROWS
@@ -130,6 +130,7 @@ class Workspace:
     base_angle: Rows = scratch("telescope", unit="rad", doc="angle of the frame at the port")
     telescope_load: Rows = scratch("telescope segment", 2, unit="N m", doc="bending by loads, smoothed")
     swing: Rows = scratch("world", unit="rad", doc="largest swing of a segment of a telescope in the step")
+    segment_swing: Rows = scratch("telescope segment", doc="square of how far each of them swings, on a GPU")
     share_of_way: Rows = scratch("world", doc="part of its way in the step that a world goes")
     telescope_twist: Rows = scratch("telescope segment", unit="1/m", doc="twist of the frames")
 
@@ -219,6 +220,7 @@ class Workspace:
 
     # Control
     norm: Rows = scratch("world", 2, doc="of the imbalance, of the forces in it")
+    norm_part: Rows = scratch("world", 2 * norms.PARTS, doc="squares of parts of them, on a GPU")
     control: Rows = scratch("control", doc="Newton's control: kernels.step.newton and statics")
     compression: Rows = scratch("world", doc="largest 1 - J of an element", keeps=0.0)
     inverted: Rows = scratch("world", doc="elements with J <= 0", keeps=0.0, integer=True)

@@ -5,7 +5,7 @@ import warp as wp
 
 from softwarp.kernels.collision import shapes
 from softwarp.kernels.collision.halving import AT_ONCE, box_halvings
-from softwarp.kernels.collision.shapes_phase import BISECTIONS
+from softwarp.kernels.collision.shape_touches import BISECTIONS
 
 box_slope = shapes.functions(wp.float32).box_slope
 

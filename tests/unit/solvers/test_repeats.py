@@ -78,7 +78,7 @@ def test_worlds_that_repeat_side_by_side_keep_their_bits(monkeypatch: pytest.Mon
     """One whose iterations have ended waits for the others, and has then what it has alone, forces of contacts too."""
     forces = (0.03, 0.05, 0.06)
     alone = [scene(1) for _ in forces]
-    monkeypatch.setattr(repeats, "_places", lambda _: len(forces))
+    monkeypatch.setattr(repeats, "_places", lambda _: [len(forces)])
     batch = scene(len(forces))
     contacts = 0
     for world, force in enumerate(forces):
@@ -93,6 +93,33 @@ def test_worlds_that_repeat_side_by_side_keep_their_bits(monkeypatch: pytest.Mon
             for world, sim in enumerate(alone):
                 assert torch.equal(batch.state_tensors()[name][world], sim.state_tensors()[name][0]), (name, world)
     assert contacts > 3 and len(repeated(batch)) == len(forces)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+def test_what_is_left_takes_fewer_places(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    """Six worlds in places for four, then for two: what they come to is what they come to alone."""
+    forces = (0.03, 0.04, 0.05, 0.06, 0.05, 0.045)
+    alone = [scene(1, device=device) for _ in forces]
+    monkeypatch.setattr(repeats, "_places", lambda _: [4, 2])
+    batch, taken = scene(len(forces), device=device), []
+    stepper = batch._steppers[0]
+    assert isinstance(stepper, RepeatingEuler)
+    for places in stepper.places:
+        step = places.step
+        monkeypatch.setattr(places, "step", lambda *a, c=places.count, s=step: (taken.append(c), s(*a)))
+    for world, force in enumerate(forces):
+        for sim, row in ((batch, world), (alone[world], 0)):
+            push(sim, (row,))
+            sim.control.rod_force[row, -1, 0] = force
+    for step in range(3):
+        for sim in (batch, *alone):
+            sim.step()
+        if step == 0:
+            assert len(repeated(batch)) == len(forces) and taken == [4, 2]
+        for name in SEEN:
+            for world, sim in enumerate(alone):
+                assert torch.equal(batch.state_tensors()[name][world], sim.state_tensors()[name][0]), (name, world)
+    assert len(repeated(batch)) > 2
 
 
 def test_a_world_that_cannot_be_stepped_says_so() -> None:
