@@ -14,13 +14,12 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import features, geometry, shapes, touches
 from softwarp.kernels.collision.halving import AT_ONCE, box_halvings
-from softwarp.model.codes import CORNER, EDGE, FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
+from softwarp.model.codes import FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
 
 BISECTIONS = 4 * AT_ONCE  # halvings of an edge
 LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
 SAMPLES = 9  # of an edge before it is searched in a grid
 STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
-ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
 UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
 
 
@@ -41,52 +40,7 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
     shape = shapes.functions(real)
     to_local, rotate, primitive, grid = shape.to_local, shape.rotate, shape.distance, shape.grid
     rotate_back, box_slope, grid_distance = shape.rotate_back, shape.box_slope, shape.grid_distance
-
-    @wp.func
-    def region_of(kind: int, size: vec3, p: vec3, n: vec3):
-        """Which part of a shape is nearest to p, from the normal there: CORNER, EDGE or FACE."""
-        region = int(FACE)
-        if kind == wp.static(Target.CAPSULE):  # capsule: its axis is an edge, the ends of the axis are corners
-            region = int(EDGE)
-            if wp.abs(p[2]) >= real(0.5) * size[1]:
-                region = int(CORNER)
-        elif kind == wp.static(Target.BOX):
-            zeros = int(0)
-            for c in range(3):
-                if wp.abs(n[c]) < real(ALIGNED):
-                    zeros += 1
-            if zeros == 1:
-                region = int(EDGE)
-            elif zeros == 0:
-                region = int(CORNER)
-        elif kind == wp.static(
-            Target.CYLINDER
-        ):  # cylinder: caps are faces, the mantle is an edge (its axis, rounded), rims are corners
-            if wp.abs(n[2]) < real(ALIGNED):
-                region = int(EDGE)
-            elif wp.abs(n[2]) < real(1.0) - real(ALIGNED):
-                region = int(CORNER)
-        return region
-
-    @wp.func
-    def region_within(kind: int, size: vec3, p: vec3, border: real):
-        """FACE where p is close to one face of a box or to a cap only, EDGE or CORNER within ``border`` of several."""
-        near = int(0)
-        if kind == wp.static(Target.BOX):
-            for c in range(3):
-                if wp.abs(p[c]) > real(0.5) * size[c] - border:
-                    near += 1
-        else:
-            if wp.abs(p[2]) > real(0.5) * size[1] - border:
-                near += 1
-            if wp.sqrt(p[0] * p[0] + p[1] * p[1]) > size[0] - border:
-                near += 1
-        region = int(FACE)
-        if near == 2:
-            region = int(EDGE)
-        elif near == 3:
-            region = int(CORNER)
-        return region
+    region_of, region_within = shape.region_of, shape.region_within
 
     @wp.func
     def local_distance(scene: Scene, target: int, local: vec3):
@@ -466,7 +420,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     rotate = shapes.functions(real).rotate
-    write_touch, keep_touch, kept_touch, urgency = vars(touches.functions(real)).values()
+    write_touch, keep_touch, kept_touch, kept_sides, urgency = vars(touches.functions(real)).values()
 
     @wp.kernel(module=module, enable_backward=False)
     def find(
@@ -486,6 +440,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         ahead: real,
         chunk_sifted_in: wp.array(dtype=wp.int32),
+        box_key_in: wp.array3d(dtype=wp.int32),
+        box_touch_in: wp.array3d(dtype=real),
+        box_seats: int,
         seats: int,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
@@ -495,7 +452,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered.
 
-        Of chunks that ``sift_shapes`` has looked at only those keys are searched that it has marked.
+        Of chunks that ``sift_shapes`` has looked at only those keys are searched that it has marked, and not those that
+        ``box_features`` has searched already.
         """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
@@ -548,7 +506,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 elif not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, normal, reach):
                     touch = second
                     if not is_second:
-                        touch, second = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                        touch, second, is_known = kept_sides(pack, key, lane, box_seats, box_key_in, box_touch_in)
+                        if not is_known:
+                            touch, second = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
                     if touch.face >= 0:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:

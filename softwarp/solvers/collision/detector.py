@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import (
+    box_features,
     broad,
     bvh,
     geometry,
@@ -43,6 +44,7 @@ from softwarp.kernels.collision import (
     surface_phase,
 )
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
+from softwarp.kernels.collision.touches import SIDE_ROWS
 from softwarp.kernels.rows import looks
 from softwarp.model import memory
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
@@ -53,7 +55,7 @@ from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 NO_POINT = 1 << 30  # first number of an embedded point where there is none
-SEATS = 2  # touches that a CPU keeps from search to measurement, times the capacity; benchmarks/contact.py
+SEATS = 4  # touches that a CPU keeps from search to measurement, times the capacity; benchmarks/contact.py
 SPREAD_PARTS = 32  # threads of a GPU that share the points of an object; benchmarks/contact.py
 
 
@@ -119,6 +121,7 @@ class Detector:
         self.k_tree = bvh.kernels(variant)
         self.k_sift = None if variant.world_fastest or variant.real is wp.float64 else sift.kernels(variant.lanes)
         self.k_near = None if self.k_sift is None else sift_shapes.kernels(variant.lanes)
+        self.k_box = box_features.kernels() if self.k_near is not None and variant.lanes > 1 else None
         self.k_strike = strike.kernels(variant)
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
@@ -212,6 +215,8 @@ class Detector:
         self.touch = real(TOUCH_ROWS * self.capacity)
         self.seats = 0 if self.variant.world_fastest else SEATS * self.capacity
         self.found_key, self.found_touch = integer(self.seats), real(TOUCH_ROWS * self.seats)
+        self.box_seats = self.seats if self.k_box is not None and self.arrays.box_chunks.size else 0
+        self.box_key, self.box_touch = integer(self.box_seats), real(2 * SIDE_ROWS * self.box_seats)
         waiting = self.capacity if self.is_patient else 0
         self.reserve_count, self.none, self.called = integer(1), integer(1), integer(1)
         self.reserve_key, self.reserve_couple, self.reserve_face = (integer(waiting) for _ in range(3))
@@ -416,7 +421,14 @@ class Detector:
             )
         if self.seats and a.shape_chunks.size:
             self.found_key.zero()
-        inputs = [self.scene, a.shape_chunks, *shared, self.sifted, self.seats]
+        searched = [self.box_key.real, self.box_touch.real]
+        if self.k_near is not None and self.k_box is not None and self.box_seats:
+            self.box_key.zero()
+            inputs = [self.scene, a.box_chunks, a.chunk_key, a.chunk_couple, motion, reach.real]
+            inputs += [*outputs[:2], self.box_seats]
+            dim = (self.packs, a.box_chunks.size)
+            wp.launch(self.k_box.search, dim=dim, inputs=inputs, outputs=searched, device=self.device)
+        inputs = [self.scene, a.shape_chunks, *shared, self.sifted, *searched, self.box_seats, self.seats]
         found = [self.found_key.real, self.found_touch.real]
         self._launch(self.k_shape.find, a.shape_chunks.size, inputs, [*outputs, *found])
         if self.k_sift is not None and a.tracked_chunks.size:
