@@ -410,7 +410,7 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Search and measurement of one variant, on single worlds."""
-    real = variant.real
+    real, world_fastest = variant.real, variant.world_fastest
     module = variant.module("proximity")
     types = geometry.structures(real)
     Scene, Motion, Touch, vec3 = types.Scene, types.Motion, types.Touch, types.vec3
@@ -506,7 +506,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 elif not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, normal, reach):
                     touch = second
                     if not is_second:
-                        touch, second, is_known = kept_sides(pack, key, lane, box_seats, box_key_in, box_touch_in)
+                        is_known = bool(False)
+                        if wp.static(not world_fastest):
+                            touch, second, is_known = kept_sides(pack, key, lane, box_seats, box_key_in, box_touch_in)
                         if not is_known:
                             touch, second = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
                     if touch.face >= 0:

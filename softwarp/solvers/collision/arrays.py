@@ -199,7 +199,7 @@ def _partners(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array]:
     return put(start, wp.int32), put(couples or [0], wp.int32)
 
 
-def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, ...]:
+def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array, wp.array]:
     """Cut the keys of every couple into pieces for one thread each; keys of one feature stay together."""
     size = CHUNK_GPU if put.variant.world_fastest else CHUNK_CPU
     key: list[int] = []
