@@ -1,8 +1,8 @@
 """Corners and edges of soft bodies against boxes, one of eight worlds at a time in SIMD registers, on a CPU in float32.
 
 ``search`` finds what ``shapes_phase.touch_shape`` finds of a feature and a box, with the same bits: the same looks and
-halvings, for the features that ``sift_shapes`` has marked. It keeps a corner's touch, or both sides of an edge, for
-``shapes_phase.find``, in one of some seats by its key. Theory: docs/theory/collision.md.
+halvings, for the features that ``sift_shapes`` has marked, and marks those that touch as ``shapes_phase.find`` does.
+Theory: docs/theory/collision.md.
 """
 
 from functools import cache
@@ -12,13 +12,16 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT, variant, vec8
 from softwarp.kernels.collision import geometry
-from softwarp.kernels.collision.geometry import DISTANCE, NORMAL, POINT_A, POINT_B, SHARE, TOUCH_ROWS
+from softwarp.kernels.collision.geometry import BARY, DISTANCE, NORMAL, POINT_A, POINT_B, SHARE, TOUCH_ROWS
 from softwarp.kernels.collision.shapes import ALIGNED
 from softwarp.kernels.collision.shapes_phase import BISECTIONS, LEVEL, STRETCH, UNSURE
 from softwarp.kernels.collision.sift import LANES
 from softwarp.kernels.collision.sift_shapes import POSE
-from softwarp.kernels.collision.touches import NOWHERE, SIDE_ROWS
+from softwarp.kernels.collision.strike import HULL_ROWS
+from softwarp.kernels.collision.touches import ASIDE, MARGIN
 from softwarp.model.codes import CORNER, EDGE, FACE, FAR, FAR_FROM, FLAT, CoupleColumn
+
+_REACH = "const lane_t reach = row(&wp::index(reach_in, pack, couple, 0), 0);"
 
 # Distance from the box, normal and region at a place in its axes: ``shapes.box`` and ``region_of``.
 _BOX = f"""
@@ -129,9 +132,7 @@ auto at = [&](const Line& line, lane_t t) -> Sample {{
     for (int c = 0; c < 3; ++c) p[c] = line.start[c] + t * line.way[c];
     const Near near = box_at(p);
     for (int c = 0; c < 3; ++c) s.n[c] = near.n[c];
-    s.t = t;
-    s.f = near.d;
-    s.region = near.region;
+    s.t = t; s.f = near.d; s.region = near.region;
     s.slope = dot(s.n, line.way) / line.length;
     return s;
 }};
@@ -313,36 +314,112 @@ auto touch_edge = [&](int edge, lane_t reach, Touch (&touch)[2]) {{
 }};
 """
 
-_CHUNK = f"""
-auto store = [](float* rows, int number, lane_t value) {{
-    __builtin_memcpy(rows + lanes * number, &value, sizeof(value));
+# ``features.is_outside``, ``touches.urgency`` and ``keep_touch``.
+_JUDGED = f"""
+auto is_outside = [&](int feature) -> mask_t {{
+    const float* const target = &wp::index(box_in, pack, 7 * object_b, 0);
+    lane_t p[3], other[3];
+    mask_t apart = {{}};
+    place({{edges ? edge_point.data[2 * feature] : feature}}, p);
+    if (edges) place({{edge_point.data[2 * feature + 1]}}, other);
+    for (int c = 0; c < 3; ++c) {{
+        const lane_t middle = edges ? 0.5f * (p[c] + other[c]) : p[c];
+        lane_t half = lane_t{{}} + (edges ? edge_radius.data[feature] : point_radius.data[feature]);
+        if (edges) half += size(other[c] - middle);
+        apart |= (mask_t)(size(middle - row(target, c)) > row(target, 3 + c) + reach + half);
+    }}
+    return apart;
 }};
-const lane_t reach = row(&wp::index(reach_in, pack, couple, 0), 0);
-const int* const hit = &wp::index(hit_in, pack, 0, 0);
-for (int key = begin; key < end; key += width) {{
+auto velocity = [&](int point, int c) -> lane_t {{
+    return row(&wp::index(v_in, pack, 0, 0), 3 * point_index.data[point] + c);
+}};
+auto along = [&](const float* rows, float sign, const lane_t (&n)[3]) -> lane_t {{
+    lane_t total = {{}};
+    for (int c = 0; c < 3; ++c) total += most(sign * n[c] * row(rows, c), sign * n[c] * row(rows, 3 + c));
+    return row(rows, 0) > row(rows, 3) ? lane_t{{}} - {FAR}f : total;
+}};
+const float* const hull = &wp::index(hull_in, pack, {HULL_ROWS} * couple, 0);
+const lane_t rest = row(&wp::index(distance_in, pack, pair, 0), 0), alarm = row(&wp::index(alarm_in, pack, pair, 0), 0);
+const lane_t limit = least(most(rest, alarm) + (is_patient ? 0.0f : slack), rest + ahead);
+const float waits = is_patient ? slack : 0.0f;
+auto urgency = [&](const Touch& t, int feature) -> mask_t {{
+    lane_t a[3], b[3] = {{}}, apart[3];
+    for (int c = 0; c < 3; ++c)
+        a[c] = edges ? (1.0f - t.share) * velocity(edge_point.data[2 * feature], c) +
+                           t.share * velocity(edge_point.data[2 * feature + 1], c)
+                     : velocity(feature, c);
+    if (frame >= 0) {{
+        const float* const twist = &wp::index(twist_in, pack, 6 * frame, 0);
+        const float* const pose = &wp::index(pose_in, pack, 7 * frame, 0);
+        lane_t w[3], arm[3];
+        for (int c = 0; c < 3; ++c) {{
+            w[c] = row(twist, 3 + c);
+            arm[c] = t.b[c] - row(pose, c);
+        }}
+        cross(w, arm, b);
+        for (int c = 0; c < 3; ++c) b[c] = row(twist, c) + b[c];
+    }}
+    for (int c = 0; c < 3; ++c) apart[c] = a[c] - b[c];
+    lane_t struck = most(along(hull, -1.0f, t.normal), -dot(a, t.normal));
+    struck += most(along(hull + 6 * lanes, 1.0f, t.normal), dot(b, t.normal));
+    const lane_t closing = most(most(-{MARGIN}f * dot(apart, t.normal), {ASIDE}f * norm(apart)), struck);
+    const mask_t none = mask_t{{}} - 1;
+    const mask_t late = (mask_t)(t.distance <= limit + waits + h * closing) ? none + 3 : none;
+    const mask_t soon = (mask_t)(t.distance <= limit + h * closing) ? none + 2 : late;
+    return (mask_t)(t.distance <= limit) ? none + 1 : soon;
+}};
+auto keep = [&](int key, const Touch& t, mask_t is_near) {{
+    if (seats <= 0) return;
+    const int seat = key % seats;
+    float* const out = &wp::index(found_touch_out, pack, {TOUCH_ROWS} * seat, 0);
+    auto store = [&](int number, lane_t value) {{
+        value = is_near ? value : row(out, number);
+        __builtin_memcpy(out + lanes * number, &value, sizeof(value));
+    }};
+    for (int c = 0; c < 3; ++c) {{
+        store({NORMAL} + c, t.normal[c]);
+        store({POINT_A} + c, t.a[c]);
+        store({POINT_B} + c, t.b[c]);
+    }}
+    store({DISTANCE}, t.distance);
+    store({SHARE}, t.share);
+    store({BARY}, lane_t{{}});
+    store({BARY} + 1, lane_t{{}});
+    int* const found = &wp::index(found_key_out, pack, seat, 0);
+    for (int lane = 0; lane < lanes; ++lane)
+        if (is_near[lane]) found[lane] = key + 1;
+}};
+"""
+
+_CHUNK = """
+int* const hit = &wp::index(hit_out, pack, 0, 0);
+mask_t hits = {};
+for (int key = begin; key < end; key += width) {
     mask_t marked;
     __builtin_memcpy(&marked, hit + lanes * key, sizeof(marked));
-    if (!any(marked)) continue;
-    const int feature = first + (key - first_key) / width, seat = key % seats;
+    marked = (mask_t)(marked != 0);
+    const int feature = first + (key - first_key) / width;
+    if (any(marked)) marked &= ~is_outside(feature);
+    const bool is_searched = any(marked);
     Touch touch[2];
-    if (edges) touch_edge(feature, reach, touch);
-    else touch[0] = touch_corner(feature);
-    for (int side = 0; side < width; ++side) {{
-        const Touch& t = touch[side];
-        float* const out = &wp::index(kept_touch_out, pack, {SIDE_ROWS} * (2 * seat + side), 0);
-        for (int c = 0; c < 3; ++c) {{
-            store(out, {NORMAL} + c, t.normal[c]);
-            store(out, {POINT_A} + c, t.a[c]);
-            store(out, {POINT_B} + c, t.b[c]);
-        }}
-        store(out, {DISTANCE}, t.distance);
-        store(out, {SHARE}, t.share);
-        const mask_t region = t.found ? t.region : t.region + {NOWHERE};
-        store(out, {TOUCH_ROWS}, __builtin_convertvector(region, lane_t));
-    }}
-    const mask_t own = marked != 0 ? mask_t{{}} + (key + 1) : mask_t{{}};
-    __builtin_memcpy(&wp::index(kept_key_out, pack, seat, 0), &own, sizeof(own));
-}}
+    if (is_searched && edges) touch_edge(feature, reach, touch);
+    else if (is_searched) touch[0] = touch_corner(feature);
+    for (int side = 0; side < width; ++side) {
+        mask_t urgent = mask_t{} - 1;
+        if (is_searched) {
+            const Touch& t = touch[side];
+            const mask_t is_wanted = marked & t.found & (mask_t)((t.region & mask) == t.region);
+            const mask_t is_near = is_wanted & (mask_t)(t.distance <= reach);
+            if (any(is_near)) {
+                keep(key + side, t, is_near);
+                urgent = is_near & (mask_t)(t.distance >= -depth) ? urgency(t, feature) : urgent;
+            }
+        }
+        __builtin_memcpy(hit + lanes * (key + side), &urgent, sizeof(urgent));
+        hits -= (mask_t)(urgent >= 0);
+    }
+}
+__builtin_memcpy(&wp::index(chunk_hits_out, pack, chunk, 0), &hits, sizeof(hits));
 """
 
 
@@ -355,19 +432,29 @@ def kernels() -> SimpleNamespace:
     target_x, target_q = place.target_x, place.target_q
 
     @wp.func_native(
-        (LANES + POSE + _BOX + _CORNER + _PLACES + _BRACKETS + _TOUCH + _EDGE + _CHUNK).replace(
+        (LANES + POSE + _REACH + _BOX + _CORNER + _PLACES + _BRACKETS + _TOUCH + _EDGE + _JUDGED + _CHUNK).replace(
             "WORLDS", str(LANE_COUNT)
         )
     )
     def search_features(
         pack: int,
+        chunk: int,
         couple: int,
+        pair: int,
+        object_b: int,
+        frame: int,
         begin: int,
         end: int,
         first: int,
         first_key: int,
         width: int,
+        mask: int,
         edges: bool,
+        is_patient: bool,
+        depth: float,
+        slack: float,
+        h: float,
+        ahead: float,
         seats: int,
         x0: vec8,
         x1: vec8,
@@ -389,10 +476,18 @@ def kernels() -> SimpleNamespace:
         face_corner: wp.array2d(dtype=wp.int32),
         position: wp.array3d(dtype=wp.float32),
         tree_box: wp.array3d(dtype=wp.float32),
+        v_in: wp.array3d(dtype=wp.float32),
+        pose_in: wp.array3d(dtype=wp.float32),
+        twist_in: wp.array3d(dtype=wp.float32),
+        box_in: wp.array3d(dtype=wp.float32),
         reach_in: wp.array3d(dtype=wp.float32),
-        hit_in: wp.array3d(dtype=wp.int32),
-        kept_key_out: wp.array3d(dtype=wp.int32),
-        kept_touch_out: wp.array3d(dtype=wp.float32),
+        hull_in: wp.array3d(dtype=wp.float32),
+        distance_in: wp.array3d(dtype=wp.float32),
+        alarm_in: wp.array3d(dtype=wp.float32),
+        chunk_hits_out: wp.array3d(dtype=wp.int32),
+        hit_out: wp.array3d(dtype=wp.int32),
+        found_key_out: wp.array3d(dtype=wp.int32),
+        found_touch_out: wp.array3d(dtype=wp.float32),
     ): ...
 
     @wp.kernel(module=module, enable_backward=False)
@@ -404,21 +499,28 @@ def kernels() -> SimpleNamespace:
         chunk_couple: wp.array(dtype=wp.int32),
         # Workspace in
         motion: Motion,
+        box_in: wp.array3d(dtype=wp.float32),
         reach_in: wp.array3d(dtype=wp.float32),
-        chunk_hits_in: wp.array3d(dtype=wp.int32),
-        hit_in: wp.array3d(dtype=wp.int32),
+        hull_in: wp.array3d(dtype=wp.float32),
+        pair_distance_in: wp.array3d(dtype=wp.float32),
+        pair_alarm_in: wp.array3d(dtype=wp.float32),
+        slack: float,
+        h: float,
+        ahead: float,
         seats: int,
         # Workspace out
-        kept_key_out: wp.array3d(dtype=wp.int32),
-        kept_touch_out: wp.array3d(dtype=wp.float32),
+        chunk_hits_out: wp.array3d(dtype=wp.int32),
+        hit_out: wp.array3d(dtype=wp.int32),
+        found_key_out: wp.array3d(dtype=wp.int32),
+        found_touch_out: wp.array3d(dtype=wp.float32),
     ):
-        """The marked features of one chunk, of corners or edges of a soft body against a box."""
+        """What ``shapes_phase.find`` does with one sifted chunk, of corners or edges of a soft body against a box."""
         pack, item = wp.tid()
         chunk = chunk_list[item]
         couple = chunk_couple[chunk]
         some = int(0)
         for lane in range(wp.static(LANE_COUNT)):
-            some = some | chunk_hits_in[pack, chunk, lane]
+            some = some | chunk_hits_out[pack, chunk, lane]
         if some == 0:
             return
         target = scene.couple[couple, wp.static(CoupleColumn.TARGET)]
@@ -441,13 +543,23 @@ def kernels() -> SimpleNamespace:
             q3[lane] = q[3]
         search_features(
             pack,
+            chunk,
             couple,
+            scene.couple[couple, wp.static(CoupleColumn.PAIR)],
+            scene.couple[couple, wp.static(CoupleColumn.OBJECT_B)],
+            scene.target_frame[target],
             chunk_key[chunk],
             chunk_key[chunk + 1],
             scene.couple[couple, wp.static(CoupleColumn.FIRST)],
             scene.couple[couple, wp.static(CoupleColumn.KEY)],
             scene.couple[couple, wp.static(CoupleColumn.WIDTH)],
+            scene.couple[couple, wp.static(CoupleColumn.MASK)],
             scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0,
+            scene.couple[couple, wp.static(CoupleColumn.PATIENT)] != 0,
+            scene.target_depth[target],
+            slack,
+            h,
+            ahead,
             seats,
             x0,
             x1,
@@ -469,10 +581,18 @@ def kernels() -> SimpleNamespace:
             scene.face_corner,
             motion.x,
             motion.tree_box,
+            motion.v,
+            motion.pose,
+            motion.twist,
+            box_in,
             reach_in,
-            hit_in,
-            kept_key_out,
-            kept_touch_out,
+            hull_in,
+            pair_distance_in,
+            pair_alarm_in,
+            chunk_hits_out,
+            hit_out,
+            found_key_out,
+            found_touch_out,
         )
 
     return SimpleNamespace(search=search)

@@ -410,7 +410,7 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Search and measurement of one variant, on single worlds."""
-    real, world_fastest = variant.real, variant.world_fastest
+    real = variant.real
     module = variant.module("proximity")
     types = geometry.structures(real)
     Scene, Motion, Touch, vec3 = types.Scene, types.Motion, types.Touch, types.vec3
@@ -420,7 +420,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     rotate = shapes.functions(real).rotate
-    write_touch, keep_touch, kept_touch, kept_sides, urgency = vars(touches.functions(real)).values()
+    write_touch, keep_touch, kept_touch, urgency = vars(touches.functions(real)).values()
 
     @wp.kernel(module=module, enable_backward=False)
     def find(
@@ -440,9 +440,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         h: real,
         ahead: real,
         chunk_sifted_in: wp.array(dtype=wp.int32),
-        box_key_in: wp.array3d(dtype=wp.int32),
-        box_touch_in: wp.array3d(dtype=real),
-        box_seats: int,
         seats: int,
         # Workspace out
         chunk_hits_out: wp.array3d(dtype=wp.int32),
@@ -452,8 +449,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Mark the keys of one chunk that touch their shape by urgency, else -1. Far couples are not entered.
 
-        Of chunks that ``sift_shapes`` has looked at only those keys are searched that it has marked, and not those that
-        ``box_features`` has searched already.
+        Of chunks that ``sift_shapes`` has looked at only those keys are searched that it has marked.
         """
         pack, item, lane = wp.tid()
         chunk = chunk_list[item]
@@ -506,11 +502,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 elif not is_outside(scene, motion, pack, lane, edges, feature, centre, extent, normal, reach):
                     touch = second
                     if not is_second:
-                        is_known = bool(False)
-                        if wp.static(not world_fastest):
-                            touch, second, is_known = kept_sides(pack, key, lane, box_seats, box_key_in, box_touch_in)
-                        if not is_known:
-                            touch, second = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
+                        touch, second = touch_shape(scene, motion, pack, lane, couple, key, x, q, reach)
                     if touch.face >= 0:
                         searched = feature
                     if touch.distance <= reach and (touch.region & mask) == touch.region:

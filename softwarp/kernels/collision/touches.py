@@ -12,8 +12,6 @@ from softwarp.kernels.collision.strike import HULL_ROWS
 
 MARGIN = 1.5  # times the way of a step along the normal that is looked ahead
 ASIDE = 0.25  # times the whole way of a step, for velocities that turn
-SIDE_ROWS = TOUCH_ROWS + 1  # of a corner or a side of an edge that ``box_features`` has searched; its region is last
-NOWHERE = 16  # added to the region of an edge that has no minimum between its ends
 
 
 @cache
@@ -76,44 +74,6 @@ def functions(scalar: Any) -> SimpleNamespace:
         return is_kept
 
     @wp.func
-    def kept_side(pack: int, row: int, lane: int, kept_rows: wp.array3d(dtype=real)):
-        """A touch from the first of its rows."""
-        touch = Touch()
-        for k in range(3):
-            touch.normal[k] = kept_rows[pack, row + wp.static(NORMAL) + k, lane]
-            touch.a[k] = kept_rows[pack, row + wp.static(POINT_A) + k, lane]
-            touch.b[k] = kept_rows[pack, row + wp.static(POINT_B) + k, lane]
-        touch.distance = kept_rows[pack, row + wp.static(DISTANCE), lane]
-        touch.share = kept_rows[pack, row + wp.static(SHARE), lane]
-        touch.region = int(kept_rows[pack, row + wp.static(TOUCH_ROWS), lane])
-        if touch.region >= wp.static(NOWHERE):
-            touch.region -= wp.static(NOWHERE)
-            touch.face = -1
-        return touch
-
-    @wp.func
-    def kept_sides(
-        pack: int,
-        key: int,
-        lane: int,
-        seats: int,
-        kept_key: wp.array3d(dtype=wp.int32),
-        kept_rows: wp.array3d(dtype=real),
-    ):
-        """Touches of a corner, or of both sides of the edge of a first key, and whether ``box_features`` knows them."""
-        touch = Touch()
-        second = Touch()
-        is_known = bool(False)
-        if seats > 0:
-            seat = key % seats
-            if kept_key[pack, seat, lane] == key + 1:
-                is_known = True
-                row = wp.static(2 * SIDE_ROWS) * seat
-                touch = kept_side(pack, row, lane, kept_rows)
-                second = kept_side(pack, row + wp.static(SIDE_ROWS), lane, kept_rows)
-        return touch, second, is_known
-
-    @wp.func
     def urgency(
         touch: Touch,
         a: vec3,
@@ -146,6 +106,4 @@ def functions(scalar: Any) -> SimpleNamespace:
             urgent = 2
         return urgent
 
-    return SimpleNamespace(
-        write_touch=write_touch, keep_touch=keep_touch, kept_touch=kept_touch, kept_sides=kept_sides, urgency=urgency
-    )
+    return SimpleNamespace(write_touch=write_touch, keep_touch=keep_touch, kept_touch=kept_touch, urgency=urgency)

@@ -44,7 +44,6 @@ from softwarp.kernels.collision import (
     surface_phase,
 )
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
-from softwarp.kernels.collision.touches import SIDE_ROWS
 from softwarp.kernels.rows import looks
 from softwarp.model import memory
 from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
@@ -215,8 +214,6 @@ class Detector:
         self.touch = real(TOUCH_ROWS * self.capacity)
         self.seats = 0 if self.variant.world_fastest else SEATS * self.capacity
         self.found_key, self.found_touch = integer(self.seats), real(TOUCH_ROWS * self.seats)
-        self.box_seats = self.seats if self.k_box is not None and self.arrays.box_chunks.size else 0
-        self.box_key, self.box_touch = integer(self.box_seats), real(2 * SIDE_ROWS * self.box_seats)
         waiting = self.capacity if self.is_patient else 0
         self.reserve_count, self.none, self.called = integer(1), integer(1), integer(1)
         self.reserve_key, self.reserve_couple, self.reserve_face = (integer(waiting) for _ in range(3))
@@ -421,16 +418,13 @@ class Detector:
             )
         if self.seats and a.shape_chunks.size:
             self.found_key.zero()
-        searched = [self.box_key.real, self.box_touch.real]
-        if self.k_near is not None and self.k_box is not None and self.box_seats:
-            self.box_key.zero()
-            inputs = [self.scene, a.box_chunks, a.chunk_key, a.chunk_couple, motion, reach.real]
-            inputs += [*outputs[:2], self.box_seats]
-            dim = (self.packs, a.box_chunks.size)
-            wp.launch(self.k_box.search, dim=dim, inputs=inputs, outputs=searched, device=self.device)
-        inputs = [self.scene, a.shape_chunks, *shared, self.sifted, *searched, self.box_seats, self.seats]
-        found = [self.found_key.real, self.found_touch.real]
-        self._launch(self.k_shape.find, a.shape_chunks.size, inputs, [*outputs, *found])
+        found, chunks = [self.found_key.real, self.found_touch.real], a.shape_chunks
+        if self.k_near is not None and self.k_box is not None and a.box_chunks.size:
+            chunks, dim = a.other_chunks, (self.packs, a.box_chunks.size)
+            inputs = [self.scene, a.box_chunks, *shared, self.seats]
+            wp.launch(self.k_box.search, dim=dim, inputs=inputs, outputs=[*outputs, *found], device=self.device)
+        inputs = [self.scene, chunks, *shared, self.sifted, self.seats]
+        self._launch(self.k_shape.find, chunks.size, inputs, [*outputs, *found])
         if self.k_sift is not None and a.tracked_chunks.size:
             inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
             inputs += [self.moved.real, laws[0], ahead < 0.0, self.chunk_hits.real, self.sought.real, self.room.real]

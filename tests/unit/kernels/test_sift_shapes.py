@@ -62,10 +62,10 @@ def test_contacts_are_those_without_a_sieve(worlds: int, scene: Callable[[int], 
         most = max(most, int(sifted.contact_count.min()))
         assert torch.equal(sifted.contact_count, plain.contact_count)
         assert torch.equal(sifted.contact_key, plain.contact_key)
-    detectors = [[s.contact.detector for s in sim.systems if s.contact is not None] for sim in (sifted, plain)]
-    kept, others = ([bool(d.box_key.S.numpy().any()) for d in of_sim] for of_sim in detectors)
-    assert not any(others)
-    assert any(kept) or scene is _scene or worlds == 1  # corners and edges in eight worlds at once
+    for system in sifted.systems:
+        assert system.contact is not None
+        detector = system.contact.detector
+        assert detector.arrays.box_chunks.size > 0 and (detector.k_box is not None) == (worlds > 1)
     assert most > 5
     assert torch.equal(sifted.node_x, plain.node_x) and torch.equal(sifted.contact_load, plain.contact_load)
 
