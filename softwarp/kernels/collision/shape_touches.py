@@ -8,12 +8,11 @@ import warp as wp
 
 from softwarp.kernels.collision import edges_in_grids, features, geometry, shapes
 from softwarp.kernels.collision.halving import AT_ONCE, box_halvings
-from softwarp.model.codes import CORNER, EDGE, FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
+from softwarp.model.codes import FACE, FAR, FAR_FROM, FLAT, Carrier, CoupleColumn, Target
 
 BISECTIONS = 4 * AT_ONCE  # halvings of an edge
 LEVEL = 1.0e-3  # slope of the distance along an edge up to which it counts as parallel
 STRETCH = 0.05  # part of an edge that must run parallel for the two ends of that part to be told apart
-ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
 UNSURE = 2.0  # times the inset: distance below which the normal of a corner is taken at its inset
 
 
@@ -37,51 +36,7 @@ def functions(scalar: Any, at_once: bool = False) -> SimpleNamespace:
     in_grid = edges_in_grids.functions(real)
     grid_of, near_part, turn_near = in_grid.grid_of, in_grid.near_part, in_grid.turn_near
 
-    @wp.func
-    def region_of(kind: int, size: vec3, p: vec3, n: vec3):
-        """Which part of a shape is nearest to p, from the normal there: CORNER, EDGE or FACE."""
-        region = int(FACE)
-        if kind == wp.static(Target.CAPSULE):  # capsule: its axis is an edge, the ends of the axis are corners
-            region = int(EDGE)
-            if wp.abs(p[2]) >= real(0.5) * size[1]:
-                region = int(CORNER)
-        elif kind == wp.static(Target.BOX):
-            zeros = int(0)
-            for c in range(3):
-                if wp.abs(n[c]) < real(ALIGNED):
-                    zeros += 1
-            if zeros == 1:
-                region = int(EDGE)
-            elif zeros == 0:
-                region = int(CORNER)
-        elif kind == wp.static(
-            Target.CYLINDER
-        ):  # cylinder: caps are faces, the mantle is an edge (its axis, rounded), rims are corners
-            if wp.abs(n[2]) < real(ALIGNED):
-                region = int(EDGE)
-            elif wp.abs(n[2]) < real(1.0) - real(ALIGNED):
-                region = int(CORNER)
-        return region
-
-    @wp.func
-    def region_within(kind: int, size: vec3, p: vec3, border: real):
-        """FACE where p is close to one face of a box or to a cap only, EDGE or CORNER within ``border`` of several."""
-        near = int(0)
-        if kind == wp.static(Target.BOX):
-            for c in range(3):
-                if wp.abs(p[c]) > real(0.5) * size[c] - border:
-                    near += 1
-        else:
-            if wp.abs(p[2]) > real(0.5) * size[1] - border:
-                near += 1
-            if wp.sqrt(p[0] * p[0] + p[1] * p[1]) > size[0] - border:
-                near += 1
-        region = int(FACE)
-        if near == 2:
-            region = int(EDGE)
-        elif near == 3:
-            region = int(CORNER)
-        return region
+    region_of, region_within = shape.region_of, shape.region_within
 
     @wp.func
     def local_distance(scene: Scene, target: int, local: vec3):

@@ -11,7 +11,9 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.model.codes import FAR, Target
+from softwarp.model.codes import CORNER, EDGE, FACE, FAR, Target
+
+ALIGNED = 1.0e-3  # component of a normal up to which it counts as zero
 
 
 @cache
@@ -107,6 +109,52 @@ def functions(real: Any) -> SimpleNamespace:
             outside = vec3(side(p[0]) * wp.max(a, none), side(p[1]) * wp.max(b, none), side(p[2]) * wp.max(c, none))
             n, d = direction(outside, n)
         return d, n
+
+    @wp.func
+    def region_of(kind: int, size: vec3, p: vec3, n: vec3):
+        """Which part of a shape is nearest to p, from the normal there: CORNER, EDGE or FACE."""
+        region = int(FACE)
+        if kind == wp.static(Target.CAPSULE):  # capsule: its axis is an edge, the ends of the axis are corners
+            region = int(EDGE)
+            if wp.abs(p[2]) >= real(0.5) * size[1]:
+                region = int(CORNER)
+        elif kind == wp.static(Target.BOX):
+            zeros = int(0)
+            for c in range(3):
+                if wp.abs(n[c]) < real(ALIGNED):
+                    zeros += 1
+            if zeros == 1:
+                region = int(EDGE)
+            elif zeros == 0:
+                region = int(CORNER)
+        elif kind == wp.static(
+            Target.CYLINDER
+        ):  # cylinder: caps are faces, the mantle is an edge (its axis, rounded), rims are corners
+            if wp.abs(n[2]) < real(ALIGNED):
+                region = int(EDGE)
+            elif wp.abs(n[2]) < real(1.0) - real(ALIGNED):
+                region = int(CORNER)
+        return region
+
+    @wp.func
+    def region_within(kind: int, size: vec3, p: vec3, border: real):
+        """FACE where p is close to one face of a box or to a cap only, EDGE or CORNER within ``border`` of several."""
+        near = int(0)
+        if kind == wp.static(Target.BOX):
+            for c in range(3):
+                if wp.abs(p[c]) > real(0.5) * size[c] - border:
+                    near += 1
+        else:
+            if wp.abs(p[2]) > real(0.5) * size[1] - border:
+                near += 1
+            if wp.sqrt(p[0] * p[0] + p[1] * p[1]) > size[0] - border:
+                near += 1
+        region = int(FACE)
+        if near == 2:
+            region = int(EDGE)
+        elif near == 3:
+            region = int(CORNER)
+        return region
 
     @wp.func
     def box_slope(size: vec3, p: vec3, d: vec3):
@@ -275,6 +323,8 @@ def functions(real: Any) -> SimpleNamespace:
         capsule=capsule,
         box=box,
         box_slope=box_slope,
+        region_of=region_of,
+        region_within=region_within,
         cylinder=cylinder,
         distance=distance,
         grid=grid,

@@ -23,7 +23,7 @@ MARGIN = 1.0e-5  # by which this looks farther than the search, relative to coor
 UNSURE = 0.1  # part of a slope that counts as level by which slopes may be off
 
 # The pose of the shape in all lanes, and vectors turned by it (``sign`` 1) or back by it (-1).
-_POSE = f"""
+POSE = f"""
 auto lane_of = [](const wp::vec_t<{LANE_COUNT}, wp::float32>& v) -> lane_t {{
     lane_t s;
     __builtin_memcpy(&s, &v, sizeof(s));
@@ -144,7 +144,7 @@ def kernels(worlds: int) -> SimpleNamespace:
     place = geometry.functions(wp.float32)
     target_x, target_q = place.target_x, place.target_q
 
-    @wp.func_native((LANES + _POSE + _TURNS + _CHUNK).replace("WORLDS", str(worlds)))
+    @wp.func_native((LANES + POSE + _TURNS + _CHUNK).replace("WORLDS", str(worlds)))
     def mark_near(
         pack: int,
         chunk: int,

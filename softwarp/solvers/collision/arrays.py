@@ -34,6 +34,7 @@ class SceneArrays:
         chunk_key, chunk_couple: First key and couple of every chunk.
         shape_chunks, surface_chunks: Chunks against shapes, and against surfaces and rods.
         node_chunks: Those against shapes whose features move with nodes.
+        box_chunks, other_chunks: Those among them against boxes, and all others against shapes.
         object_start, object_couple: One couple with every other object that an object can touch.
         tracked: Objects of couples whose features remember how far they were.
         tracked_chunks: Chunks of those couples.
@@ -56,6 +57,8 @@ class SceneArrays:
     shape_chunks: wp.array
     surface_chunks: wp.array
     node_chunks: wp.array
+    box_chunks: wp.array
+    other_chunks: wp.array
     object_start: wp.array
     object_couple: wp.array
     object_round: wp.array
@@ -197,13 +200,16 @@ def _partners(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array]:
     return put(start, wp.int32), put(couples or [0], wp.int32)
 
 
-def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array]:
+def _chunks(
+    scene: CollisionScene, put: _Packer
+) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array, wp.array, wp.array]:
     """Cut the keys of every couple into pieces for one thread each; keys of one feature stay together."""
     size = CHUNK_GPU if put.variant.world_fastest else CHUNK_CPU
     key: list[int] = []
     owner: list[int] = []
     kinds: tuple[list[int], list[int]] = ([], [])
     on_nodes: list[int] = []
+    on_boxes: list[int] = []
     is_node = scene.points.array("kind", np.int32) == Carrier.NODE
     end = 0
     for number, (couple, count) in enumerate(scene.key_ranges()):
@@ -213,6 +219,7 @@ def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp
         for begin in range(0, count, max(size // couple.width, 1) * couple.width):
             kinds[int(is_surface)].append(len(key))
             on_nodes += [len(key)] if moves else []
+            on_boxes += [len(key)] if moves and kind == Target.BOX else []
             key.append(end + begin)
             owner.append(number)
         end += count
@@ -222,4 +229,6 @@ def _chunks(scene: CollisionScene, put: _Packer) -> tuple[wp.array, wp.array, wp
         put.integers(kinds[0]),
         put.integers(kinds[1]),
         put.integers(on_nodes),
+        put.integers(on_boxes),
+        put.integers(np.setdiff1d(kinds[0], on_boxes)),
     )

@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.collision import (
+    box_features,
     broad,
     bvh,
     geometry,
@@ -53,7 +54,7 @@ from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
 
 NO_POINT = 1 << 30  # first number of an embedded point where there is none
-SEATS = 2  # touches that a CPU keeps from search to measurement, times the capacity; benchmarks/contact.py
+SEATS = 4  # touches that a CPU keeps from search to measurement, times the capacity; benchmarks/contact.py
 SPREAD_PARTS = 32  # threads of a GPU that share the points of an object; benchmarks/contact.py
 
 
@@ -119,6 +120,7 @@ class Detector:
         self.k_tree = bvh.kernels(variant)
         self.k_sift = None if variant.world_fastest or variant.real is wp.float64 else sift.kernels(variant.lanes)
         self.k_near = None if self.k_sift is None else sift_shapes.kernels(variant.lanes)
+        self.k_box = box_features.kernels() if self.k_near is not None and variant.lanes > 1 else None
         self.k_strike = strike.kernels(variant)
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
@@ -416,9 +418,13 @@ class Detector:
             )
         if self.seats and a.shape_chunks.size:
             self.found_key.zero()
-        inputs = [self.scene, a.shape_chunks, *shared, self.sifted, self.seats]
-        found = [self.found_key.real, self.found_touch.real]
-        self._launch(self.k_shape.find, a.shape_chunks.size, inputs, [*outputs, *found])
+        found, chunks = [self.found_key.real, self.found_touch.real], a.shape_chunks
+        if self.k_near is not None and self.k_box is not None and a.box_chunks.size:
+            chunks, dim = a.other_chunks, (self.packs, a.box_chunks.size)
+            inputs = [self.scene, a.box_chunks, *shared, self.seats]
+            wp.launch(self.k_box.search, dim=dim, inputs=inputs, outputs=[*outputs, *found], device=self.device)
+        inputs = [self.scene, chunks, *shared, self.sifted, self.seats]
+        self._launch(self.k_shape.find, chunks.size, inputs, [*outputs, *found])
         if self.k_sift is not None and a.tracked_chunks.size:
             inputs = [self.scene, a.tracked_chunks, a.chunk_key, a.chunk_couple, motion, self.box.real, reach.real]
             inputs += [self.moved.real, laws[0], ahead < 0.0, self.chunk_hits.real, self.sought.real, self.room.real]

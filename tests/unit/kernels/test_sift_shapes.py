@@ -62,6 +62,10 @@ def test_contacts_are_those_without_a_sieve(worlds: int, scene: Callable[[int], 
         most = max(most, int(sifted.contact_count.min()))
         assert torch.equal(sifted.contact_count, plain.contact_count)
         assert torch.equal(sifted.contact_key, plain.contact_key)
+    for system in sifted.systems:
+        assert system.contact is not None
+        detector = system.contact.detector
+        assert detector.arrays.box_chunks.size > 0 and (detector.k_box is not None) == (worlds > 1)
     assert most > 5
     assert torch.equal(sifted.node_x, plain.node_x) and torch.equal(sifted.contact_load, plain.contact_load)
 
