@@ -70,6 +70,38 @@ class Replayed:
         return capture.graph
 
 
+class OwnArrays:
+    """State, commands, parameters and gradients of as many worlds as a model has.
+
+    Args:
+        model: Scene.
+
+    Attributes:
+        worlds: State, commands and parameters.
+        gradients: Those by all these.
+        names: Of the arrays of ``gradients``.
+        views: Torch views of the four, by name, with the names of parts of frames besides.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.worlds = create(State, model), create(Control, model), create(Parameters, model)
+        self.gradients = create(Gradients, model)
+        state, control, parameters, gradients = (interop.views(each, model) for each in (*self.worlds, self.gradients))
+        self.names = tuple(gradients)
+        if model.frames is not None:
+            state |= interop.frame_aliases(state, model, *FRAMES)
+            gradients |= interop.frame_aliases(gradients, model, *FRAMES)
+            control |= interop.force_aliases(control, model)
+            named = interop.force_aliases({"frame_force": gradients["command_frame_force"]}, model)
+            gradients |= {f"command_{name}": view for name, view in named.items()}
+        self.views = state, control, parameters, gradients
+
+    def part(self, worlds: slice) -> Gradients:
+        """Gradients of some worlds."""
+        found: Gradients = worlds_slice(self.gradients, worlds.start, worlds.stop)
+        return found
+
+
 class Directions:
     """Slopes of worlds, which one factor of a step pushes through it in all directions.
 
@@ -146,11 +178,9 @@ class DifferentiableWorlds:
 
         model = sim.model
         self.sim, self.model, self.h = sim, model, sim.dt
-        containers = create(State, model), create(Control, model), create(Parameters, model)
-        arrays = create(Gradients, model)
-        self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
-        self.gradients = interop.views(arrays, model)
-        self.arrays = tuple(self.gradients)
+        room = OwnArrays(model)
+        self.state, self.control, self.parameters, self.gradients = room.views
+        self.arrays = room.names
         self.names: Sequence[str] = (*STATE, *FRAMES) if model.has_moving_frames else STATE
         memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         if model.joints is not None:
@@ -158,17 +188,10 @@ class DifferentiableWorlds:
         if model.relaxes:
             self.names = (*self.names, *MEMORIES)
         self.memory = tuple(name for name in memory if name not in self.names)
-        if model.frames is not None:
-            self.state |= interop.frame_aliases(self.state, model, *FRAMES)
-            self.gradients |= interop.frame_aliases(self.gradients, model, *FRAMES)
-            self.control |= interop.force_aliases(self.control, model)
-            named = {"frame_force": self.gradients["command_frame_force"]}
-            for name, view in interop.force_aliases(named, model).items():
-                self.gradients[f"command_{name}"] = view
         self._index = index = AdjointIndex.of(model)
-        self._twins = twins = sim.make_twins(*containers)
+        self._twins = twins = sim.make_twins(*room.worlds)
         steppers = [stepper(system, self.h) for _, system in twins]
-        parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
+        parts = [room.part(each) for each, _ in twins]
         pulls = [
             _adjoint(each, part, index, rest=rest)
             for each, part in zip(steppers, parts, strict=True)

@@ -146,6 +146,7 @@ class Leaning:
         self.product, self.pushed = s.rows(nodes), s.rows(3 * m.dof_count)
         self.start_v = s.rows(s.dof_room) if frames is None else frames.start_v
         self.lean = s.rows(s.dof_room) if frames is None else frames.lean
+        self.still = s.rows(s.dof_room)
         self.sums = s.rows(relaxation_adjoint.SUM_ROWS * m.body_count)
         self.value = s.rows(2 * max(m.frame_count, 1))
         self.before = wp.zeros_like(gradients.rayleigh_stiffness)
@@ -153,12 +154,10 @@ class Leaning:
 
     def load(self) -> None:
         """Memories at the start of a step; needs the factors of bodies."""
-        term, s, m, i = self.term, self.shard, self.model, self.shard.input
+        term = self.term
         if term is not None:
             term.lean()
-            inputs = [m.node_count, m.body_count, m.dof_node, m.node_body, term.lean_share.real]
-            inputs += [i["node_memory"].real, i["frame_memory"].real]
-            s.each_real(self.k.lean, m.dof_count, inputs, [self.lean.real])
+            term.lean_dofs(self.still, self.lean)
 
     def seed(self, seed: Rows, y: Rows) -> None:
         """Add what memories at the end of the step have by velocities to both right-hand sides."""

@@ -49,30 +49,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return vec3(offset[item, 0], offset[item, 1], offset[item, 2])
 
     @wp.kernel(module=module, enable_backward=False)
-    def lean(
-        node_count: int,
-        bodies: int,
-        # Model
-        dof_node: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        # Workspace in
-        lean_in: wp.array3d(dtype=real),
-        node_memory_in: wp.array3d(dtype=real),
-        frame_memory_in: wp.array3d(dtype=real),
-        # Workspace out
-        lean_out: wp.array3d(dtype=real),
-    ):
-        """e y of one dof."""
-        pack, dof, lane = wp.tid()
-        slot = dof_node[dof]
-        for c in range(3):
-            if slot < node_count:
-                y = lean_in[pack, node_body[slot], lane] * node_memory_in[pack, 3 * slot + c, lane]
-            else:
-                y = lean_in[pack, bodies, lane] * frame_memory_in[pack, 3 * (slot - node_count) + c, lane]
-            lean_out[pack, 3 * dof + c, lane] = y
-
-    @wp.kernel(module=module, enable_backward=False)
     def velocities(
         body_nodes: int,
         # Model
@@ -526,7 +502,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 pose_bar_out[world, 7 * frame + 3 + c] = by_q[c]
 
     return SimpleNamespace(
-        lean=lean,
         velocities=velocities,
         carried_velocities=carried_velocities,
         twists=twists,
