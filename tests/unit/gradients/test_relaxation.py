@@ -89,10 +89,18 @@ def test_gradients_are_those_of_differences(base: str, integrator: str, options:
     check(Rollout(sim), given, test_rigid.loss, SIZES)
 
 
-@pytest.mark.parametrize("integrator", ["bdf2", pytest.param("euler", marks=pytest.mark.slow)])
-def test_both_modes_agree(integrator: str) -> None:
-    """The forward mode has slopes of memories too."""
-    sim = beam(integrator=integrator, quadratic=False)
+@pytest.mark.parametrize(
+    ("integrator", "quadratic"),
+    [
+        ("bdf2", True),
+        pytest.param("bdf2", False, marks=pytest.mark.slow),
+        pytest.param("euler", False, marks=pytest.mark.slow),
+        pytest.param("euler", True, marks=pytest.mark.slow),
+    ],
+)
+def test_both_modes_agree(integrator: str, quadratic: bool) -> None:
+    """The forward mode has slopes of memories too, and of quadratic elements that are carried."""
+    sim = beam(integrator=integrator, quadratic=quadratic)
     compare(Rollout(sim), given_of(sim, [1]), test_rigid.loss)
 
 
