@@ -20,7 +20,8 @@ class Diverged(RuntimeError):
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _contacts(sim))
-    if sim.options.pressure_tangent and sim.model.has_moving_frames:
+    is_linear = sim.options.newton_iterations == 1
+    if sim.options.pressure_tangent and is_linear and sim.model.has_moving_frames:
         told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
         return f"{told}; take pressure_tangent=False"
     return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator != "euler" else ()), None)
@@ -82,8 +83,10 @@ def _options(sim: Simulation) -> Iterator[str]:
         told = "steps of integrator 'trapezoidal' have no gradient yet where they are not those of 'bdf2'"
         yield f"{told}; take integrator='bdf2' or 'euler'"
     if options.newton_iterations > 1:
-        count = options.newton_iterations
-        yield f"steps of newton_iterations={count} have no gradient yet; take newton_iterations=1 and a shorter dt"
+        model, told = sim.model, f"steps of newton_iterations={options.newton_iterations} have no gradient"
+        if model.contact is not None or model.joints is not None:
+            other = "contact" if model.joints is None else "joints"
+            yield f"{told} beside {other} yet; take newton_iterations=1 and a shorter dt"
     if options.repeat_swing < float("inf"):
         told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
         yield f"{told} have no gradient yet; take repeat_swing=inf"
@@ -96,7 +99,7 @@ def _second_order(sim: Simulation) -> Iterator[str]:
         yield f"a joint {told}"
     if sim.model.contact is not None:
         yield f"contact {told}, which it falls back to beside contact anyway, with a shorter dt"
-    if sim.options.pressure_tangent:
+    if sim.options.pressure_tangent and sim.options.newton_iterations == 1:
         yield f"the tangent of pressures {told}, or pressure_tangent=False"
     frames = sim.model.frames
     if frames is not None and sim.model.has_moving_frames:

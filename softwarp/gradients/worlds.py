@@ -21,6 +21,7 @@ from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.joint_adjoint import JointStepAdjoint
 from softwarp.solvers.look_adjoint import LookStepAdjoint
 from softwarp.solvers.look_directional import LookStepDirection
+from softwarp.solvers.newton_adjoint import NewtonAdjoint
 from softwarp.solvers.repeats import RepeatingEuler
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
@@ -168,6 +169,7 @@ class DifferentiableWorlds:
         memory: Names of what else a step reads of the state, without gradients.
         pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
+        unfinished: Likewise, worlds where the iterations of a step ended above their tolerance.
         rough: Likewise, worlds that a step of second order has taken as a rough one.
         lagging: Likewise, worlds where a kinematic body had another velocity than its command.
     """
@@ -217,9 +219,15 @@ class DifferentiableWorlds:
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
         self.pressed = torch.zeros_like(self.state["compression"])
-        self.failed, self.rough, self.lagging = (
-            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(3)
+        self.failed, self.unfinished, self.rough, self.lagging = (
+            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(4)
         )
+        self._adrift = [
+            ((worlds.start, worlds.stop), wp.to_torch(part.adrift, requires_grad=False).flatten())
+            for (worlds, _), pull in zip(twins, pulls, strict=True)
+            for part in (pull.pulls if isinstance(pull, SecondOrderAdjoint) else [pull])
+            if isinstance(part, NewtonAdjoint)
+        ]
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
@@ -235,7 +243,10 @@ class DifferentiableWorlds:
         for name, value in parameters.items():
             self.parameters[name].copy_(value)
         self.failed.zero_()
+        self.unfinished.zero_()
         self.rough.zero_()
+        for _, adrift in self._adrift:
+            adrift.zero_()
         self.lagging.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
@@ -256,9 +267,7 @@ class DifferentiableWorlds:
     @property
     def directions(self) -> Directions | RowDirections:
         """What pushes slopes through steps, made when it is first asked for."""
-        if self._directions is None and (
-            self.model.has_moving_frames or self.model.relaxes or self.sim.options.integrator != "euler"
-        ):
+        if self._directions is None and (self.model.has_moving_frames or self.model.relaxes or not self.solution_bytes):
             self._directions = RowDirections(self)
         elif self._directions is None:
             self._directions = Directions(self._twins, self.model, self.h, self._index, self._workers)
@@ -281,6 +290,7 @@ class DifferentiableWorlds:
         """Keep what a step tells of trouble."""
         self.pressed.copy_(self.pressed.maximum(self.state["compression"]))
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
+        self.unfinished.logical_or_(self.state["status"] == int(Status.MAX_ITERATIONS))
         if self.model.has_kinematic and self.model.has_moving_frames:
             told = self.control["body_velocity"]
             behind = (self.state["body_twist"] - told).abs() > LAG * (1.0 + told.abs().amax())
@@ -288,6 +298,14 @@ class DifferentiableWorlds:
             self.lagging.logical_or_(behind)
         for (begin, end), rough in self._rough:
             self.rough[begin:end].logical_or_(rough[: end - begin] != 0)
+
+    @property
+    def adrift(self) -> torch.Tensor:
+        """Worlds whose gradients did not come to stay since ``start``, bool, (world,)."""
+        found = self.failed.new_zeros(self.failed.shape)
+        for (begin, end), adrift in self._adrift:
+            found[begin:end].logical_or_(adrift[: end - begin] != 0)
+        return found
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
         """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
@@ -343,6 +361,8 @@ def _adjoint(
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
         return SecondOrderAdjoint(steps, gradients, index)
+    if steps.control is not None:
+        return NewtonAdjoint(steps, gradients, index)
     if steps.system.model.joints is not None:
         return JointStepAdjoint(steps.system, steps.h, gradients, index)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint

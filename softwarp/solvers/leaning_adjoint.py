@@ -32,6 +32,7 @@ class LeaningFrames(FrameAdjoint):
         lean: e y of dofs.
         mind: Gradients by e y of frames.
         felt_v: Velocities of dofs that inertia resists.
+        ahead: Gradients by the velocities of dofs that a stage is linearised with.
     """
 
     def __init__(self, system: System, model: FrameModel, h: float, gradients: Gradients, *, predicts: bool) -> None:
@@ -40,7 +41,8 @@ class LeaningFrames(FrameAdjoint):
         self.k_felt, self.k_memory = leaning_adjoint.kernels(s.variant), relaxation_adjoint.kernels(s.variant)
         self.term = next((term for term in system.terms if isinstance(term, RelaxationTerm)), None)
         self.predicts = predicts
-        self.start_v, self.lean, self.felt_v = (s.rows(s.dof_room) for _ in range(3))
+        self.start_v, self.lean, self.felt_v, self.ahead = (s.rows(s.dof_room) for _ in range(4))
+        self.follows = 1.0  # whether such a stage is linearised with the velocities of its start
         self.felt = s.rows(leaning_adjoint.FELT_ROWS * max(model.carried_count, 1))
         self.mind, self.early = s.rows(6 * model.count), s.rows(3 * model.count)
         self.inertial_v, self.early_twist = self.felt_v, s.rows(6 * model.count)
@@ -97,13 +99,14 @@ class LeaningFrames(FrameAdjoint):
         inputs = [s.model.node_count, m.welded_frame, m.frame_owner, m.owner_body, m.slot_carried]
         inputs += [w.body_damping.real, self.items.real]
         s.each_real(self.k_felt.welded_felt, m.welded_frame.size, inputs, [self.felt.real])
-        inputs = [self.h, float(self.predicts), s.lanes, s.model.node_count]
+        inputs = [self.h, float(self.predicts), self.follows, s.lanes, s.model.node_count]
         inputs += [m.frame_master, m.frame_spin, m.frame_owner, m.owner_body, m.frame_dof]
         inputs += [self.item_start, self.item, m.carried_slot, m.corner_start, m.corner, self.is_kinematic]
         inputs += [w.body_damping.real, i["pose0"].real, self.start_v.real, self.twist0.real, w.compound.real]
         inputs += [self.felt_v.real, p.real, self.frame_p.real, self.start.real, self.corner.real, self.way.real]
         inputs += [self.items.real, self.felt.real, self.bare.real, self.early.real]
-        outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity, self.mind.real]
+        outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
+        outputs += [self.mind.real, self.ahead.real]
         s.each_real(self.k_felt.frame_gradients, m.count, inputs, outputs)
 
     def _to_sources(self, p: Rows) -> None:
