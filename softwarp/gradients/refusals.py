@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import Carrier, Spin, Target
+from softwarp.model.codes import Carrier, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
@@ -95,18 +95,10 @@ def _options(sim: Simulation) -> Iterator[str]:
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
-    if sim.model.joints is not None:
-        yield f"a joint {told}"
     if sim.model.contact is not None:
         yield f"contact {told}, which it falls back to beside contact anyway, with a shorter dt"
     if sim.options.pressure_tangent and sim.options.newton_iterations == 1:
         yield f"the tangent of pressures {told}, or pressure_tangent=False"
-    frames = sim.model.frames
-    if frames is not None and sim.model.has_moving_frames:
-        tops = np.flatnonzero(frames.frame_spin.numpy() == int(Spin.FREE_TOP))
-        tops = tops[tops < frames.rigid_count]
-        if tops.size:
-            yield f"rigid body {sim.model.rigid_names[int(tops[0])]!r}, which nothing elastic holds, {told}"
 
 
 SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)

@@ -22,6 +22,7 @@ from softwarp.solvers.leaning_adjoint import Leaning, LeaningFrames
 from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.quadratic import QuadraticTerm
+from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
 
@@ -57,6 +58,7 @@ class StepAdjoint:
     """
 
     predicts = False
+    pace: Pace | None = None  # what a stage of a longer step does of the commands
 
     def __init__(
         self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
@@ -155,7 +157,7 @@ class StepAdjoint:
         system.load(without=without)
         system.scale(self.h)
         system.measure_rows()
-        system.command(self.h)
+        system.command(self.h, self.pace)
         if self.leaning is not None:
             self.leaning.load()
 

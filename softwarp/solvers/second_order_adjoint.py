@@ -15,6 +15,7 @@ from softwarp.model.gradients import FRAMES, MEMORIES, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.implicit_euler import ImplicitEuler
+from softwarp.solvers.joint_adjoint import JointStepAdjoint
 from softwarp.solvers.newton_adjoint import NewtonAdjoint
 from softwarp.solvers.second_order import SecondOrder, Stage
 from softwarp.solvers.stage_adjoint import StageAdjoint
@@ -57,6 +58,8 @@ class SecondOrderAdjoint:
     def _stage(self, number: int, index: AdjointIndex) -> StepAdjoint:
         stepper, gradients, step = self.stepper, self.gradients, self.stepper.steps[number]
         if isinstance(step, ImplicitEuler):
+            if step.control is None:  # beside joints, at the start
+                return JointStepAdjoint(step.system, step.h, gradients, index, step.pace)
             return NewtonAdjoint(step, gradients, index)
         return StageAdjoint(stepper.system, step.h, step.pace, stepper.predict, gradients, index)
 
@@ -98,6 +101,13 @@ class SecondOrderAdjoint:
         rests = [self.kept[name] for name in FRAMES]
         inputs = [first.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0]]
         s.each_real(self.k_frames.part_frames, frames.count, inputs, [*bars, *rests])
+        of_first = self.pulls[0].frames
+        if of_first is not None:
+            of_first.more_share.zero()
+            lapse = (first.factor - 1.0) * first.length * stepper.h
+            inputs = [first.factor, lapse, s.lanes, frames.frame_master, frames.frame_spin]
+            inputs += [starts[0], starts[1], ends[0], ends[1], s.work.compound.real]
+            s.each_real(self.k_frames.part_tops, frames.count, inputs, [*bars, *rests, of_first.more_share.real])
 
     def _pull(self, pull: StepAdjoint, stage: Stage, parameters: bool) -> None:
         self.stepper.set_lag(stage)

@@ -160,7 +160,7 @@ def jointed(base: str = "rod", integrator: str = "euler") -> sw.Simulation:
     builder.attach(body, box=((0.19, -1, -1), (0.2 + 1e-6, 1, 1)), to=lower)
     builder.add_cable([upper, lower], [(0.03, 0.01, 0.01), (0.17, 0.01, 0.01)], stiffness=200.0, damping=1.0)
     builder.add_marker(lower, (0.2, 0.0, 0.01))
-    return finished(builder, integrator=integrator)
+    return finished(builder, integrator=integrator, **({} if integrator == "euler" else EXACT))
 
 
 def touching(base: str = "free", passes: int = 1, integrator: str = "euler") -> sw.Simulation:
@@ -252,12 +252,11 @@ SCENES: dict[str, Callable[..., sw.Simulation]] = {
     "touching beside joints": partial(touching, passes=0),
 }
 QUIET = 0.1  # part of the sizes at which no step of second order is a rough one
+LOUD = 1.0  # of stages beside joints, which are linearised at their start: at rest a projected tangent has kinks
 REFUSED = {  # what has no gradient with bdf2
-    "jointed to a rod": "a joint has no gradient with integrator 'bdf2' yet; take integrator='euler'",
-    "jointed to a base": "a joint has no gradient with integrator 'bdf2' yet; take integrator='euler'",
     "touching": "contact has no gradient with integrator 'bdf2' yet; take integrator='euler'",
     "touching what is moved": "contact has no gradient with integrator 'bdf2' yet; take integrator='euler'",
-    "touching beside joints": "a joint has no gradient with integrator 'bdf2' yet; take integrator='euler'",
+    "touching beside joints": "contact has no gradient with integrator 'bdf2' yet; take integrator='euler'",
 }
 
 
@@ -273,16 +272,16 @@ def test_gradients_are_those_of_differences(scene: str) -> None:
 @pytest.mark.parametrize(
     "scene",
     [
-        pytest.param(name, marks=pytest.mark.slow if name in ("carried by a base", "with gas") else ())
+        pytest.param(name, marks=() if name in ("carried by a rod", "with a volume") else pytest.mark.slow)
         for name in SCENES
         if name not in REFUSED
     ],
 )
 def test_gradients_of_steps_of_second_order(scene: str) -> None:
-    """The same with ``bdf2``, nearer to rest; pressures that nothing depends on have gradient 0."""
+    """The same with ``bdf2``, nearer to rest without joints; pressures that nothing depends on have gradient 0."""
     sim = SCENES[scene](integrator="bdf2")
-    given, sizes = given_of(sim, QUIET)
-    pressure = given["state"].pop("cavity_pressure", None)
+    given, sizes = given_of(sim, LOUD if sim.model.joints is not None else QUIET)
+    pressure = given["state"].pop("cavity_pressure", None) if sim.model.joints is None else None
     check(Rollout(sim), given, loss, sizes)
     if pressure is not None:
         found = gradients(Rollout(sim), {**given, "state": {"cavity_pressure": pressure}}, loss)
