@@ -56,6 +56,9 @@ def require_static_gradient(sim: Simulation) -> None:
     if sim.model.has_moving_frames:
         for found in _resting_frames(sim):
             raise ValueError(f"gradients.Equilibrium: {found}; take a Rollout with damping that comes to rest")
+    if sim.model.membranes is not None:
+        told = f"equilibria with membrane {sim.model.membranes.names[0]!r} have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     for found in _parts(sim.model):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
@@ -137,8 +140,6 @@ def _parts(model: Model) -> Iterator[str]:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
     if model.frames is not None:
         yield from _frames(model, model.frames)
-    if model.membranes is not None:
-        yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
     if model.reduction is not None:
         yield "reduced bodies have no gradient yet; take the full mesh"
     if model.relaxes and (model.joints is not None or model.contact is not None):

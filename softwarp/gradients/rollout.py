@@ -127,7 +127,9 @@ class Rollout:
                 ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
                 ``law_parameter``, ``relaxation_ratio`` and ``relaxation_time`` of Maxwell branches,
-                ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of contact,
+                ``membrane_youngs`` and ``membrane_nu``,
+                ``cable_stiffness`` and ``cable_damping`` of cables that stretch,
+                ``pair_mu`` of contact,
                 ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
                 ``rod_rayleigh_stiffness``, ``body_mass`` and ``body_damping``, ``joint_stiffness`` and
                 ``joint_damping`` of servos, shaped as in ``sim.params`` or so that

@@ -267,7 +267,12 @@ class DifferentiableWorlds:
     @property
     def directions(self) -> Directions | RowDirections:
         """What pushes slopes through steps, made when it is first asked for."""
-        if self._directions is None and (self.model.has_moving_frames or self.model.relaxes or not self.solution_bytes):
+        if self._directions is None and (
+            self.model.has_moving_frames
+            or self.model.relaxes
+            or self.model.membranes is not None
+            or not self.solution_bytes
+        ):
             self._directions = RowDirections(self)
         elif self._directions is None:
             self._directions = Directions(self._twins, self.model, self.h, self._index, self._workers)

@@ -19,8 +19,10 @@ from softwarp.solvers.contact_adjoint import ContactAdjoint, contact_solution
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.leaning_adjoint import Leaning, LeaningFrames
+from softwarp.solvers.membrane_adjoint import MembraneAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
+from softwarp.solvers.terms.membranes import MembraneTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
 from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.terms.tets import TetTerm
@@ -74,12 +76,14 @@ class StepAdjoint:
         self.node_bar = s.rows(3 * m.node_count)
         self.element_v = self.row_v = self.node_v
         self.corner = s.rows(s.work.element_force.real.shape[1])
-        self.tets = self.quadratic = None
+        self.tets = self.quadratic = self.skin = None
         for term in system.terms:
             if isinstance(term, TetTerm):
                 self.tets = TetAdjoint(s, term.tets.tets, m.tet_count)
             elif isinstance(term, QuadraticTerm):
                 self.quadratic = QuadraticAdjoint(s, term.model, term.points.tets, term.first)
+            elif isinstance(term, MembraneTerm):
+                self.skin = MembraneAdjoint(s, term.model)
         self.way, self.point = s.rows(3 * points), s.rows(3 * points)
         self.force, self.q, self.change, self.gap, self.compliant, self.bound, self.measured = (
             s.rows(rows) for _ in range(7)
@@ -145,6 +149,8 @@ class StepAdjoint:
                 term.tets.stiffness()
             elif isinstance(term, QuadraticTerm):
                 term.points.stiffness()
+            elif isinstance(term, MembraneTerm):
+                term.stiffness()
 
     def _find_forces(self) -> None:
         self.system.forces()
@@ -393,6 +399,8 @@ class StepAdjoint:
         if self.quadratic is not None:
             self.quadratic.pull(*elements, parameters=parameters)
             self.quadratic.add_mass(self.p, self.node_mass_p)
+        if self.skin is not None:
+            self.skin.pull(*elements)
         if not m.row_count:
             return
         inputs = [h, m.point_node, m.point_weight, self.index.point_row, self.row_v.real, self.node_p.real]
@@ -444,6 +452,8 @@ class StepAdjoint:
             self._to_moduli(x.body_tets, self.tets.parameter)
         if self.quadratic is not None:
             self._to_moduli(x.body_points, self.quadratic.points.parameter)
+        if self.skin is not None:
+            self.skin.to_parameters(self.h, g)
         inputs = [*scalars, m.node_count, m.node_body, x.node_heft, i["density"].real, self.node_p.real]
         s.each_real(self.k.gravity, None, inputs, [g.gravity])
         if self.rest is not None:

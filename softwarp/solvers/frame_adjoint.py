@@ -150,6 +150,7 @@ class FrameAdjoint:
             self.attachments.products.add(
                 kind, w.body_stiffness.S, kind.velocity if of_points else velocity, self.stiff
             )
+        self.attachments.products.add_skin(w.body_stiffness.S, velocity, self.stiff)
 
     def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
         """What carried nodes have goes to their frames; they have no gradients of their own."""

@@ -52,6 +52,7 @@ CONTROLS = {  # commands at random of this size, and the change
 CHANGES = {  # of parameters; of others relative to them
     "gravity": 1e-3,
     "nu": 1e-5,
+    "membrane_nu": 1e-3,
     "pair_mu": 1e-5,
     "rayleigh_mass": 1e-2,
     "rayleigh_stiffness": 1e-6,
@@ -88,6 +89,7 @@ def beam(
     chamber: str = "pressure",
     *,
     hits: bool = False,
+    skin: bool = False,
     **options: Any,
 ) -> SoftBody:
     """A soft beam along x with a law of own parameters, a chamber, a loaded top and a cable that stretches.
@@ -97,6 +99,7 @@ def beam(
         at: Its corner.
         chamber: Control of the chamber.
         hits: Leave the traction out.
+        skin: Glue a membrane to all of its surface.
         **options: Of the body.
     """
     size = (0.1, 0.04, 0.04)
@@ -109,6 +112,8 @@ def beam(
     builder.add_cavity(body, skin.nodes + (0.03, 0.01, 0.01) + np.array(at), skin.surface(), control=chamber, **rate)  # type: ignore[arg-type]
     path = np.array([(0.01, 0.03, 0.03), (0.05, 0.03, 0.035), (0.09, 0.03, 0.03)]) + at
     builder.add_cable(body, path, stiffness=300.0, damping=2.0)
+    if skin:
+        builder.add_membrane(body, mesh.surface(), thickness=5e-4, youngs=4e5, nu=0.3, density=900.0)
     if not hits:
         low = np.array(at) + (0.0, 0.0, 0.0399)
         builder.add_traction(body, (0.0, 0.0, 1.0), box=(low - (1.0, 1.0, 0.0), low + 1.0))
@@ -125,11 +130,16 @@ def rod(builder: sw.ModelBuilder, end: tuple[float, float, float], damping: floa
 
 
 def carried(
-    base: str = "rod", chamber: str = "pressure", integrator: str = "euler", *, relaxes: bool = False
+    base: str = "rod",
+    chamber: str = "pressure",
+    integrator: str = "euler",
+    *,
+    relaxes: bool = False,
+    skin: bool = False,
 ) -> sw.Simulation:
     """A beam on the end of a rod, or on a moved base beside one, with a box at its own end."""
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
-    body = beam(builder, (0.0, 0.0, 0.0), chamber, **({"relaxation": MEMORY} if relaxes else {}))
+    body = beam(builder, (0.0, 0.0, 0.0), chamber, skin=skin, **({"relaxation": MEMORY} if relaxes else {}))
     stem = rod(builder, (0.0, 0.02, 0.02), 0.0 if relaxes else 0.005)
     box = builder.add_rigid(sw.Box((0.02, 0.06, 0.05)), mass=0.03, pose=(0.11, 0.02, 0.02), damping=0.4)
     builder.attach(body, box=((0.0999, -1, -1), (1, 1, 1)), to=box)
@@ -243,6 +253,7 @@ SCENES: dict[str, Callable[..., sw.Simulation]] = {
     "carried by a rod": carried,
     "carried by a base": partial(carried, "kinematic"),
     "with a memory": partial(carried, relaxes=True),
+    "with a skin": partial(carried, skin=True),
     "with a volume": partial(carried, chamber="volume"),
     "with gas": partial(carried, chamber="gas"),
     "jointed to a rod": jointed,

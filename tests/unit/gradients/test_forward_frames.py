@@ -63,6 +63,13 @@ def test_joints_and_motors(motor: str) -> None:
 
 
 @SLOW
+def test_membranes() -> None:
+    """Triangles on a cube's surface; by rows."""
+    sim = cube("nh_log", skin=True)
+    compare(Rollout(sim), inputs(sim, [1]), weights(sim))
+
+
+@SLOW
 def test_joints_in_steps_of_second_order() -> None:
     """Stages beside joints."""
     sim = test_joints.arm("slow", integrator="bdf2")
