@@ -142,10 +142,9 @@ def _parts(model: Model) -> Iterator[str]:
         yield from _frames(model, model.frames)
     if model.reduction is not None:
         yield "reduced bodies have no gradient yet; take the full mesh"
-    if model.relaxes and (model.joints is not None or model.contact is not None):
+    if model.relaxes and model.joints is not None:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
-        other = "joints" if model.joints is not None else "contact"
-        told = f"the relaxation of body {model.body_names[body]!r} beside {other} has no gradient yet"
+        told = f"the relaxation of body {model.body_names[body]!r} beside joints has no gradient yet"
         yield f"{told}; leave its Maxwell branch out"
 
 

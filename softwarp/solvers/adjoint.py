@@ -391,6 +391,8 @@ class StepAdjoint:
         if self.leaning is not None:
             self.leaning.velocities(self.node_v)
             self.leaning.push(self.seed, self.q)
+            if self.contact is not None:
+                self.contact.add_forces(self.leaning.pushed)
         if self.frames is not None:
             self.frames.lift(self.element_v, self.node_p)
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)

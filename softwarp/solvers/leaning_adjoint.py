@@ -132,7 +132,7 @@ class Leaning:
     Attributes:
         element_v, row_v: What elements and rows have in the place of the velocities of nodes.
         start_v, lean: Velocities of dofs at the start of a stage, else 0; and e y.
-        pushed: The seed less h H' q.
+        pushed: The seed less h H' q, and less what contacts have likewise.
     """
 
     def __init__(
