@@ -32,6 +32,8 @@ CHANGES = {
         "density": 1e-2,
         "rayleigh_mass": 1e-3,
         "rayleigh_stiffness": 1e-6,
+        "relaxation_ratio": 1e-5,
+        "relaxation_time": 1e-6,
         "membrane_youngs": 10.0,
         "membrane_nu": 1e-3,
         "gravity": 1e-3,
