@@ -35,7 +35,7 @@ CHANGES = {
         "relaxation_ratio": 1e-5,
         "relaxation_time": 1e-6,
         "membrane_youngs": 10.0,
-        "membrane_nu": 1e-3,
+        "membrane_nu": 1e-4,
         "gravity": 1e-3,
         "cable_stiffness": 1e-3,
         "cable_damping": 1e-5,
@@ -55,7 +55,7 @@ def cube(
     elastic: bool = False,
     chamber: dict[str, Any] | None = None,
     locked: bool = True,
-    skin: bool = False,
+    covered: bool = False,
     **options: Any,
 ) -> sw.Simulation:
     """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker.
@@ -68,7 +68,7 @@ def cube(
         quadratic: One cell of quadratic elements instead, with a traction on a face.
         elastic: The cable whose length is commanded stretches.
         chamber: Control and limits of the chamber; pressure control with a rate if left out.
-        skin: Glue a membrane to the cube's surface; its corners are those of linear elements.
+        covered: Glue a membrane to the cube's surface; its corners are those of linear elements.
         locked: A corner moves along x and z only.
         **options: Of the simulation.
     """
@@ -92,7 +92,7 @@ def cube(
     law_of_air = {"max_pressure_rate": 2e4} if chamber is None else chamber
     builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), **law_of_air)
     builder.add_marker(body, (SIDE, 0.05, 0.05))
-    if skin:
+    if covered:
         surface = meshing.box(size, (2, 2, 2)).surface()
         builder.add_membrane(body, surface, thickness=1e-3, youngs=4e5, nu=0.3, density=900.0)
     if quadratic:

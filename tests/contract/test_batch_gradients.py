@@ -15,7 +15,7 @@ PATHS = [
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
     pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64", marks=pytest.mark.slow),
     pytest.param({"solver_path": "lanes", "integrator": "bdf2"}, "float32", "cpu", id="second_order"),
-    pytest.param({"skin": True, "solver_path": "lanes"}, "float32", "cpu", id="skin"),
+    pytest.param({"covered": True, "solver_path": "lanes"}, "float32", "cpu", id="skin"),
     pytest.param(NEWTON | {"solver_path": "lanes"}, "float32", "cpu", id="newton"),
     pytest.param(NEWTON | {"solver_path": "scalar"}, "float64", "cpu", id="newton_float64", marks=pytest.mark.slow),
     pytest.param(QUADRATIC | {"solver_path": "lanes"}, "float32", "cpu", id="quadratic", marks=pytest.mark.slow),

@@ -93,7 +93,7 @@ def test_gradients_of_the_exact_tangent() -> None:
 )
 def test_membranes(options: dict[str, Any]) -> None:
     """By their moduli, and by all that stretches and presses them; the negative part of their stress is not in A."""
-    sim = cube("nh_log", skin=True, **options)
+    sim = cube("nh_log", covered=True, **options)
     check(Rollout(sim), inputs(sim, [1]), weights(sim))
 
 

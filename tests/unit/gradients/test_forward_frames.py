@@ -65,7 +65,7 @@ def test_joints_and_motors(motor: str) -> None:
 @SLOW
 def test_membranes() -> None:
     """Triangles on a cube's surface; by rows."""
-    sim = cube("nh_log", skin=True)
+    sim = cube("nh_log", covered=True)
     compare(Rollout(sim), inputs(sim, [1]), weights(sim))
 
 

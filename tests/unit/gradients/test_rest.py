@@ -91,6 +91,6 @@ def test_refusals() -> None:
     with pytest.raises(ValueError, match="'rest_x' has no gradient"):
         Equilibrium(sim)(parameters={"rest_x": shape})
     with pytest.raises(ValueError, match="membrane 'membrane0' has no gradient by the rest shape yet"):
-        Rollout(cube(skin=True), rest=True)
+        Rollout(cube(covered=True), rest=True)
     with pytest.raises(ValueError, match="equilibria with membrane 'membrane0' have no gradient yet"):
-        Equilibrium(cube(skin=True))
+        Equilibrium(cube(covered=True))
