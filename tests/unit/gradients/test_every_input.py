@@ -264,6 +264,7 @@ SCENES: dict[str, Callable[..., sw.Simulation]] = {
     "touching with a memory": partial(touching, relaxes=True),
     "touching beside joints": partial(touching, passes=0),
 }
+ELSEWHERE = ("with a membrane", "touching with a memory")  # quick tests of these are in files of their own
 QUIET = 0.1  # part of the sizes at which no step of second order is a rough one
 LOUD = 1.0  # of stages beside joints, which are linearised at their start: at rest a projected tangent has kinks
 REFUSED = {  # what has no gradient with bdf2
@@ -274,7 +275,9 @@ REFUSED = {  # what has no gradient with bdf2
 }
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    "scene", [pytest.param(name, marks=pytest.mark.slow if name in ELSEWHERE else ()) for name in SCENES]
+)
 def test_gradients_are_those_of_differences(scene: str) -> None:
     """By all that the scene has; what touches is pressed."""
     sim = SCENES[scene]()

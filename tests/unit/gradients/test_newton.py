@@ -85,6 +85,7 @@ def test_all_inputs_at_once(scene: str) -> None:
     check(Rollout(sim), given, test_every_input.loss, sizes)
 
 
+@SLOW
 def test_both_modes_agree() -> None:
     """The forward mode is one by rows."""
     sim = solved(test_rigid.arm())
