@@ -14,6 +14,9 @@ from tests.cases import material
 SIDE = 0.1  # m, of the cube
 STEPS = 3
 
+# Parameters that are drawn last, behind those of laws: draws of others stay as they were.
+LATER = {"relaxation_ratio": 1e-5, "relaxation_time": 1e-6, "membrane_youngs": 10.0, "membrane_nu": 1e-4}
+
 # Inputs of a rollout by group, with the size of a step for central differences, which is also that of the change.
 CHANGES = {
     "state": {"node_x": 1e-7, "node_v": 1e-5, "cavity_pressure": 3.0},
@@ -36,6 +39,7 @@ CHANGES = {
         "cable_stiffness": 1e-3,
         "cable_damping": 1e-5,
         "pair_mu": 1e-5,
+        **LATER,
     },
 }
 Inputs = dict[str, dict[str, torch.Tensor]]
@@ -51,6 +55,7 @@ def cube(
     elastic: bool = False,
     chamber: dict[str, Any] | None = None,
     locked: bool = True,
+    covered: bool = False,
     **options: Any,
 ) -> sw.Simulation:
     """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker.
@@ -63,6 +68,7 @@ def cube(
         quadratic: One cell of quadratic elements instead, with a traction on a face.
         elastic: The cable whose length is commanded stretches.
         chamber: Control and limits of the chamber; pressure control with a rate if left out.
+        covered: Glue a membrane to the cube's surface; its corners are those of linear elements.
         locked: A corner moves along x and z only.
         **options: Of the simulation.
     """
@@ -86,6 +92,9 @@ def cube(
     law_of_air = {"max_pressure_rate": 2e4} if chamber is None else chamber
     builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), **law_of_air)
     builder.add_marker(body, (SIDE, 0.05, 0.05))
+    if covered:
+        surface = meshing.box(size, (2, 2, 2)).surface()
+        builder.add_membrane(body, surface, thickness=1e-3, youngs=4e5, nu=0.3, density=900.0)
     if quadratic:
         builder.add_traction(body, (0.0, 0.0, 1.0), box=((-1.0, -1.0, 0.099), (1.0, 1.0, 1.0)))
     model = builder.finalize(num_worlds=num_worlds, device=device, precision=precision)
@@ -117,7 +126,7 @@ def inputs(sim: sw.Simulation, seeds: list[int], strain: float = 0.1) -> Inputs:
             },
             "parameters": {
                 name: getattr(sim.params, name)[0].cpu().numpy() * rng.uniform(0.9, 1.1)
-                for name in (*CHANGES["parameters"], "law_parameter")
+                for name in (*(n for n in CHANGES["parameters"] if n not in LATER), "law_parameter", *LATER)
             },
         }
         for group, found in values.items():

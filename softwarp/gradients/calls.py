@@ -110,6 +110,7 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
                 for slope, each in zip(along, now, strict=True):
                     slope[place].copy_(each[name])
     check_steps(call)
+    check_adrift(worlds)
     return kept, slopes
 
 
@@ -117,6 +118,7 @@ def check_steps(call: Call) -> None:
     """Refuse what would make the gradients of the steps that have been taken mean nothing."""
     worlds, plan = call.worlds, call.plan
     _check_failed(worlds.failed)
+    _check_unfinished(worlds.unfinished)
     _check_rough(worlds.rough)
     if "control.body_velocity" in plan.names:
         _check_lagging(worlds.lagging)
@@ -132,6 +134,26 @@ def _check_failed(failed: torch.Tensor) -> None:
         raise Diverged(
             f"rollout: a step failed in {len(worlds)} of {len(failed)} worlds ({listed}), whose gradient would mean "
             "nothing; take a shorter dt or milder commands and parameters there"
+        )
+
+
+def _check_unfinished(unfinished: torch.Tensor) -> None:
+    worlds = unfinished.nonzero().flatten().tolist()
+    if worlds:
+        raise Diverged(
+            f"rollout: Newton's iterations of a step ended above their tolerance in world {worlds[0]} and "
+            f"{len(worlds) - 1} others; a gradient is that of a step that has converged: take more newton_iterations, "
+            "a larger newton_tolerance, a shorter dt, or newton_iterations=1"
+        )
+
+
+def check_adrift(worlds: DifferentiableWorlds) -> None:
+    """Refuse gradients that did not come to stay."""
+    found = worlds.adrift.nonzero().flatten().tolist()
+    if found:
+        raise Diverged(
+            f"rollout: the gradient of a step of Newton's method in world {found[0]} and {len(found) - 1} others is "
+            "not found by going on, as near where something buckles; take a shorter dt, or newton_iterations=1"
         )
 
 

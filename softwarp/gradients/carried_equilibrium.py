@@ -6,19 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-import warp as wp
 
-from softwarp import interop
 from softwarp.gradients.frame_equilibrium import by_turn
 from softwarp.gradients.refusals import Diverged
-from softwarp.gradients.worlds import Replayed
-from softwarp.model.gradients import FRAMES, Gradients
-from softwarp.model.state import Control, Parameters, State, create, worlds_slice
+from softwarp.gradients.resting import RestingWorlds
 from softwarp.simulation import Simulation
-from softwarp.solvers.adjoint_index import AdjointIndex
-from softwarp.solvers.frame_tangent import FrameTangent
-from softwarp.solvers.implicit_euler import ImplicitEuler
-from softwarp.threads import Workers
 
 Tensors = Mapping[str, torch.Tensor]
 LONG = 1.0e3  # s, of a step without momentum, whose matrix is the tangent of the forces to rounding
@@ -29,7 +21,7 @@ LEFT = {"float32": 1.0e-4, "float64": 1.0e-12}  # of a gradient: what an adjoint
 PLACES = ("node_x", "frame_pose")
 
 
-class CarriedWorlds:
+class CarriedWorlds(RestingWorlds):
     """As many worlds as a simulation has, at rest.
 
     Static solves of the simulation lead near, steps without momentum to rounding: each is a step of Newton's method
@@ -40,44 +32,13 @@ class CarriedWorlds:
 
     Args:
         sim: Soft bodies beside rods and rigid bodies; cables under force control.
-
-    Attributes:
-        state, control, parameters: Views of these worlds' arrays.
-        gradients: Views of ``Gradients``.
-        solved: Number of the equilibrium that the worlds are in.
     """
 
     def __init__(self, sim: Simulation) -> None:
-        self.sim, self.model = sim, sim.model
-        model = sim.model
-        containers = create(State, model), create(Control, model), create(Parameters, model)
-        arrays = create(Gradients, model)
-        self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
-        self.gradients = interop.views(arrays, model)
-        self.state |= interop.frame_aliases(self.state, model, *FRAMES)
-        self.control |= interop.force_aliases(self.control, model)
-        named = {"frame_force": self.gradients["command_frame_force"]}
-        for name, view in interop.force_aliases(named, model).items():
-            self.gradients[f"command_{name}"] = view
-        twins, index = sim.make_twins(*containers), AdjointIndex.of(model)
-        parts = [
-            FrameTangent(system, LONG, worlds_slice(arrays, each.start, each.stop), index) for each, system in twins
-        ]
-        steppers = [ImplicitEuler(system, LONG) for _, system in twins]
-        workers = Workers(len(twins)) if len(twins) > 1 else None
-        self._measure, self._multiply, self._multiply_all, self._correct = (
-            Replayed(model.device, [getattr(part, name) for part in parts], workers)
-            for name in ("measure", "multiply", "multiply_all", "correct")
-        )
-        self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
-        self._counts = [each.stop - each.start for each, _ in twins]
-        self._p, self._left = (
-            [wp.to_torch(getattr(part, name).real, requires_grad=False) for part in parts]
-            for name in ("p", "imbalance")
-        )
+        super().__init__(sim, LONG)
         self._find_unknowns()
         self._last: dict[str, torch.Tensor] | None = None
-        self.solved, self._measured = 0, -1
+        self._measured = -1
 
     def _find_unknowns(self) -> None:
         """Where the unknowns of nodes and frames are, and which node moves with which frame."""
@@ -95,33 +56,17 @@ class CarriedWorlds:
         self._carried = (carrier >= 0).nonzero().flatten()
         self._carrier = carrier[self._carried]
 
-    def start(self, given: Tensors) -> None:
-        """Take over what the simulation has, and what is given by names as ``control.body_force``."""
-        sources = self.sim.state_tensors(), self.sim.control.tensors(), self.sim.params.tensors()
-        for views, held in zip((self.state, self.control, self.parameters), sources, strict=True):
-            for name, value in held.items():
-                if name in views:
-                    views[name].copy_(value)
-        self.give(given)
-
-    def give(self, given: Tensors) -> None:
-        """Put what is given in place."""
-        groups = {"control": self.control, "params": self.parameters}
-        for name, value in given.items():
-            group, _, own = name.partition(".")
-            groups[group][own].copy_(value)
-
     def settle(self, given: Tensors, tolerance: float | None, most: int, *, warm: bool) -> torch.Tensor:
         """Bring all worlds to rest; which ones are there, (world,).
 
         Args:
-            given: As of ``start``.
+            given: As of ``follow``.
             tolerance: Way of the last step, in extents and rad; None takes ``WAY``.
             most: Iterations of the static solve.
             warm: Whether to begin where the last equilibrium was.
         """
         limit = WAY[self.model.precision] if tolerance is None else tolerance
-        self.start(given)
+        self.follow(given)
         arrived = torch.zeros(self.model.num_worlds, dtype=torch.bool, device=self._free.device)
         if warm and self._last is not None:
             for name, value in self._last.items():
@@ -135,7 +80,7 @@ class CarriedWorlds:
                 self.state[name].copy_(torch.where(mask, held[name], value))
             arrived = self._polish(limit)
         self._last = {name: self.state[name].clone() for name in PLACES}
-        self.solved += 1
+        self.token += 1
         return arrived
 
     def _solve(self, given: Tensors, most: int) -> dict[str, torch.Tensor]:
@@ -184,7 +129,7 @@ class CarriedWorlds:
 
         Args:
             number: Of the equilibrium; that of the last one stands.
-            given: As of ``start``.
+            given: As of ``follow``.
             places: Its positions and poses.
             by_x: (world, node, 3).
             by_pose: (world, frame, 7).
@@ -193,7 +138,7 @@ class CarriedWorlds:
             Diverged: If the adjoint of a world does not come to an end.
         """
         if number != self._measured:
-            self.start(given)
+            self.follow(given)
             for name, value in places.items():
                 self.state[name].copy_(value)
             self._rest()
@@ -229,7 +174,7 @@ class CarriedWorlds:
         left, going = y, size > 0.0
         limit, before = LEFT[self.model.precision], size
         for _ in range(CORRECTIONS):
-            self._put(torch.where(going[:, None], LONG * left, 0.0))
+            self._put(torch.where(going[:, None], self.h * left, 0.0))
             self._correct()
             for name in PLACES:
                 self.gradients[name].zero_()
@@ -256,7 +201,7 @@ class CarriedWorlds:
     def _put(self, rows: torch.Tensor) -> None:
         """Unknowns into the shards."""
         begin = 0
-        for view, count in zip(self._left, self._counts, strict=True):
+        for view, count in zip(self._imbalance, self._counts, strict=True):
             packs, _, lanes = view.shape
             part = rows.new_zeros((packs * lanes, rows.shape[1]))
             part[:count] = rows[begin : begin + count]
@@ -278,7 +223,7 @@ class AtRestTogether(torch.autograd.Function):
         arrived = worlds.settle(given, limits["tolerance"], limits["max_iterations"], warm=owner.warm)
         owner.check(arrived, torch.zeros(len(arrived)))
         places = tuple(worlds.state[name].clone() for name in PLACES)
-        ctx.worlds, ctx.names, ctx.number = worlds, names, worlds.solved
+        ctx.worlds, ctx.names, ctx.number = worlds, names, worlds.token
         ctx.save_for_backward(*places, *tensors)
         return places
 

@@ -8,17 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 
-from softwarp import interop
-from softwarp.gradients.worlds import Replayed
-from softwarp.model.gradients import FRAMES, Gradients
-from softwarp.model.state import Control, Parameters, State, create, worlds_slice
+from softwarp.gradients.resting import RestingWorlds
 from softwarp.simulation import Simulation
-from softwarp.solvers.adjoint_index import AdjointIndex
-from softwarp.solvers.frame_tangent import FrameTangent, groups_of, neighbours_of
-from softwarp.solvers.implicit_euler import ImplicitEuler
-from softwarp.threads import Workers
+from softwarp.solvers.frame_tangent import groups_of, neighbours_of
 
 Tensors = Mapping[str, torch.Tensor]
 STEPS = 25  # of a round
@@ -30,7 +23,7 @@ UNHURRIED = 1.0e20  # N/s, a rate that bounds nothing
 TOLERANCE = {"float32": 3.0e-5, "float64": 1.0e-10}  # extents, and rad, of the last correction
 
 
-class FrameWorlds:
+class FrameWorlds(RestingWorlds):
     """As many worlds as a simulation has, which Newton's method brings to rest.
 
     With the imbalance r of forces and its exact tangent R by places and turns, a correction is -R^-1 r. The tangent
@@ -39,43 +32,12 @@ class FrameWorlds:
 
     Args:
         sim: Rods and rigid bodies; cables under force control.
-
-    Attributes:
-        state, control, parameters: Views of these worlds' arrays.
-        gradients: Views of ``Gradients``.
-        token: Number of the equilibrium that the worlds are in.
     """
 
     def __init__(self, sim: Simulation) -> None:
-        self.sim, self.model, self.h = sim, sim.model, sim.dt
-        model, frames = sim.model, sim.model.frames
-        assert frames is not None
-        containers = create(State, model), create(Control, model), create(Parameters, model)
-        arrays = create(Gradients, model)
-        self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
-        self.gradients = interop.views(arrays, model)
-        self.state |= interop.frame_aliases(self.state, model, *FRAMES)
-        self.control |= interop.force_aliases(self.control, model)
-        named = {"frame_force": self.gradients["command_frame_force"]}
-        for name, view in interop.force_aliases(named, model).items():
-            self.gradients[f"command_{name}"] = view
-        twins, index = sim.make_twins(*containers), AdjointIndex.of(model)
-        tangents = [
-            FrameTangent(system, self.h, worlds_slice(arrays, each.start, each.stop), index) for each, system in twins
-        ]
-        steppers = [ImplicitEuler(system, self.h) for _, system in twins]
-        workers = Workers(len(twins)) if len(twins) > 1 else None
-        self._measure, self._multiply, self._multiply_all = (
-            Replayed(model.device, [getattr(tangent, name) for tangent in tangents], workers)
-            for name in ("measure", "multiply", "multiply_all")
-        )
-        self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
-        self._refresh = Replayed(model.device, [system.refresh for _, system in twins], workers)
-        self._counts = [each.stop - each.start for each, _ in twins]
-        self._imbalance = [wp.to_torch(tangent.imbalance.real, requires_grad=False) for tangent in tangents]
-        self._p = [wp.to_torch(tangent.p.real, requires_grad=False) for tangent in tangents]
+        super().__init__(sim, sim.dt)
         self._find_unknowns()
-        self.token, self._fresh, self._solved = 0, -1, 0
+        self._fresh, self._solved = -1, 0
         self._factor: tuple[torch.Tensor, torch.Tensor] | None = None
         self._last: torch.Tensor | None = None
 
@@ -111,22 +73,12 @@ class FrameWorlds:
             given: Tensors.
             warm: Whether poses are those of the last equilibrium.
         """
-        sources = self.sim.state_tensors(), self.sim.control.tensors(), self.sim.params.tensors()
-        for views, held in zip((self.state, self.control, self.parameters), sources, strict=True):
-            for name, value in held.items():
-                if name in views:
-                    views[name].copy_(value)
+        self.follow({})
         self.parameters["cable_max_rate"].fill_(UNHURRIED)
-        self._give(given)
+        self.give(given)
         if warm and self._last is not None:
             self.state["frame_pose"].copy_(self._last)
         self._rest()
-
-    def _give(self, given: Tensors) -> None:
-        groups = {"control": self.control, "params": self.parameters}
-        for name, value in given.items():
-            group, _, own = name.partition(".")
-            groups[group][own].copy_(value)
 
     def _rest(self) -> None:
         for name in ("node_v", "frame_twist"):
@@ -298,7 +250,7 @@ class FrameWorlds:
             By name, (loss, world, ...).
         """
         if token != self.token:
-            self._give(given)
+            self.give(given)
             self.state["frame_pose"].copy_(pose)
             self._rest()
             self.token = token

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from softwarp.model.codes import Carrier, Spin, Target
+from softwarp.model.codes import Carrier, Target
 from softwarp.model.frames import FrameModel
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
@@ -20,7 +20,8 @@ class Diverged(RuntimeError):
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _contacts(sim))
-    if sim.options.pressure_tangent and sim.model.has_moving_frames:
+    is_linear = sim.options.newton_iterations == 1
+    if sim.options.pressure_tangent and is_linear and sim.model.has_moving_frames:
         told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
         return f"{told}; take pressure_tangent=False"
     return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator != "euler" else ()), None)
@@ -55,6 +56,9 @@ def require_static_gradient(sim: Simulation) -> None:
     if sim.model.has_moving_frames:
         for found in _resting_frames(sim):
             raise ValueError(f"gradients.Equilibrium: {found}; take a Rollout with damping that comes to rest")
+    if sim.model.membranes is not None:
+        told = f"equilibria with membrane {sim.model.membranes.names[0]!r} have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     for found in _parts(sim.model):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")
     if sim.model.contact is not None:
@@ -82,8 +86,10 @@ def _options(sim: Simulation) -> Iterator[str]:
         told = "steps of integrator 'trapezoidal' have no gradient yet where they are not those of 'bdf2'"
         yield f"{told}; take integrator='bdf2' or 'euler'"
     if options.newton_iterations > 1:
-        count = options.newton_iterations
-        yield f"steps of newton_iterations={count} have no gradient yet; take newton_iterations=1 and a shorter dt"
+        model, told = sim.model, f"steps of newton_iterations={options.newton_iterations} have no gradient"
+        if model.contact is not None or model.joints is not None:
+            other = "contact" if model.joints is None else "joints"
+            yield f"{told} beside {other} yet; take newton_iterations=1 and a shorter dt"
     if options.repeat_swing < float("inf"):
         told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
         yield f"{told} have no gradient yet; take repeat_swing=inf"
@@ -92,18 +98,10 @@ def _options(sim: Simulation) -> Iterator[str]:
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
-    if sim.model.joints is not None:
-        yield f"a joint {told}"
     if sim.model.contact is not None:
         yield f"contact {told}, which it falls back to beside contact anyway, with a shorter dt"
-    if sim.options.pressure_tangent:
+    if sim.options.pressure_tangent and sim.options.newton_iterations == 1:
         yield f"the tangent of pressures {told}, or pressure_tangent=False"
-    frames = sim.model.frames
-    if frames is not None and sim.model.has_moving_frames:
-        tops = np.flatnonzero(frames.frame_spin.numpy() == int(Spin.FREE_TOP))
-        tops = tops[tops < frames.rigid_count]
-        if tops.size:
-            yield f"rigid body {sim.model.rigid_names[int(tops[0])]!r}, which nothing elastic holds, {told}"
 
 
 SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)
@@ -142,14 +140,11 @@ def _parts(model: Model) -> Iterator[str]:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
     if model.frames is not None:
         yield from _frames(model, model.frames)
-    if model.membranes is not None:
-        yield f"membrane {model.membranes.names[0]!r} has no gradient yet; leave it out"
     if model.reduction is not None:
         yield "reduced bodies have no gradient yet; take the full mesh"
-    if model.relaxes and (model.joints is not None or model.contact is not None):
+    if model.relaxes and model.joints is not None:
         body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
-        other = "joints" if model.joints is not None else "contact"
-        told = f"the relaxation of body {model.body_names[body]!r} beside {other} has no gradient yet"
+        told = f"the relaxation of body {model.body_names[body]!r} beside joints has no gradient yet"
         yield f"{told}; leave its Maxwell branch out"
 
 

@@ -23,7 +23,7 @@ class RestShape:
         held: 1 where a node is fixed or an axis locked, (node, 3).
 
     Raises:
-        ValueError: For a model with quadratic tetrahedra or tractions.
+        ValueError: For a model with quadratic tetrahedra, tractions or membranes.
     """
 
     def __init__(self, model: Model, like: torch.Tensor) -> None:
@@ -32,6 +32,9 @@ class RestShape:
             raise ValueError(f"gradients: rest=True: {told}")
         if model.tractions is not None:
             told = "faces under tractions have no gradient by the rest shape; command their sum as control.node_force"
+            raise ValueError(f"gradients: rest=True: {told}")
+        if model.membranes is not None:
+            told = f"membrane {model.membranes.names[0]!r} has no gradient by the rest shape yet; leave rest=True out"
             raise ValueError(f"gradients: rest=True: {told}")
         self.x = torch.as_tensor(model.node_rest).to(like)
         self._extent = model.extent

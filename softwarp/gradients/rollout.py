@@ -10,7 +10,7 @@ import torch
 
 from softwarp import checks
 from softwarp.advice import nearest
-from softwarp.gradients.calls import Call, Plan, check_steps, push
+from softwarp.gradients.calls import Call, Plan, check_adrift, check_steps, push
 from softwarp.gradients.refusals import require_differentiable, require_directions
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
@@ -68,8 +68,8 @@ class Rollout:
 
     Args:
         sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, rigid bodies, and joints;
-            backward Euler or, without joints and contact, BDF2, with one linearisation per step. Its ``dt`` and
-            options are taken over now.
+            backward Euler or, without contact, BDF2, with one linearisation per step or, without contact and joints,
+            as many as solve it. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -84,6 +84,8 @@ class Rollout:
         require_differentiable(sim)
         if rest and sim.options.integrator != "euler":
             raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
+        if rest and sim.options.newton_iterations > 1:
+            raise ValueError("gradients.Rollout: rest shapes have gradients with newton_iterations=1 only")
         if rest and sim.model.has_moving_frames:
             told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
@@ -125,7 +127,9 @@ class Rollout:
                 ``cavity_gas`` [m^3], shaped as in ``sim.control``, or with a leading axis of steps.
             parameters: ``youngs``, ``nu``, ``density``, ``rayleigh_mass``, ``rayleigh_stiffness``, ``gravity`` and
                 ``law_parameter``, ``relaxation_ratio`` and ``relaxation_time`` of Maxwell branches,
-                ``cable_stiffness`` and ``cable_damping`` of cables that stretch, ``pair_mu`` of contact,
+                ``membrane_youngs`` and ``membrane_nu``,
+                ``cable_stiffness`` and ``cable_damping`` of cables that stretch,
+                ``pair_mu`` of contact,
                 ``rod_youngs``, ``rod_nu``, ``rod_density``, ``rod_rayleigh_mass`` and
                 ``rod_rayleigh_stiffness``, ``body_mass`` and ``body_damping``, ``joint_stiffness`` and
                 ``joint_damping`` of servos, shaped as in ``sim.params`` or so that
@@ -166,7 +170,8 @@ class Rollout:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
         factors = checks.flag(factors, "rollout: factors")
         if factors and not self.worlds.solution_bytes:
-            raise ValueError("rollout: integrator 'bdf2' keeps no factors; leave factors=True out")
+            told = "newton_iterations above 1" if self.worlds.sim.options.integrator == "euler" else "integrator 'bdf2'"
+            raise ValueError(f"rollout: {told} keeps no factors; leave factors=True out")
         return Plan(tuple(given), frozenset(moving), count, every, factors, self._rest), given
 
     def fit(self, group: str, name: str, value: Any, moving: list[str]) -> torch.Tensor:
@@ -282,6 +287,7 @@ class _Steps(torch.autograd.Function):
                     (by[step] if name in plan.moving else by).add_(gradients[f"command_{name}"])
         if room is not None:
             worlds.give_back(room)
+        check_adrift(worlds)
         found = {f"control.{name}": by for name, by in by_commands.items()}
         found |= {name: gradients[name.removeprefix("state.")].clone() for name in wanted if name.startswith("state.")}
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}

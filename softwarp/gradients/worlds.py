@@ -21,6 +21,7 @@ from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.joint_adjoint import JointStepAdjoint
 from softwarp.solvers.look_adjoint import LookStepAdjoint
 from softwarp.solvers.look_directional import LookStepDirection
+from softwarp.solvers.newton_adjoint import NewtonAdjoint
 from softwarp.solvers.repeats import RepeatingEuler
 from softwarp.solvers.second_order import SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
@@ -68,6 +69,38 @@ class Replayed:
         with interop.capturing(self._device) as capture:
             launch()
         return capture.graph
+
+
+class OwnArrays:
+    """State, commands, parameters and gradients of as many worlds as a model has.
+
+    Args:
+        model: Scene.
+
+    Attributes:
+        worlds: State, commands and parameters.
+        gradients: Those by all these.
+        names: Of the arrays of ``gradients``.
+        views: Torch views of the four, by name, with the names of parts of frames besides.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.worlds = create(State, model), create(Control, model), create(Parameters, model)
+        self.gradients = create(Gradients, model)
+        state, control, parameters, gradients = (interop.views(each, model) for each in (*self.worlds, self.gradients))
+        self.names = tuple(gradients)
+        if model.frames is not None:
+            state |= interop.frame_aliases(state, model, *FRAMES)
+            gradients |= interop.frame_aliases(gradients, model, *FRAMES)
+            control |= interop.force_aliases(control, model)
+            named = interop.force_aliases({"frame_force": gradients["command_frame_force"]}, model)
+            gradients |= {f"command_{name}": view for name, view in named.items()}
+        self.views = state, control, parameters, gradients
+
+    def part(self, worlds: slice) -> Gradients:
+        """Gradients of some worlds."""
+        found: Gradients = worlds_slice(self.gradients, worlds.start, worlds.stop)
+        return found
 
 
 class Directions:
@@ -136,6 +169,7 @@ class DifferentiableWorlds:
         memory: Names of what else a step reads of the state, without gradients.
         pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
+        unfinished: Likewise, worlds where the iterations of a step ended above their tolerance.
         rough: Likewise, worlds that a step of second order has taken as a rough one.
         lagging: Likewise, worlds where a kinematic body had another velocity than its command.
     """
@@ -146,11 +180,9 @@ class DifferentiableWorlds:
 
         model = sim.model
         self.sim, self.model, self.h = sim, model, sim.dt
-        containers = create(State, model), create(Control, model), create(Parameters, model)
-        arrays = create(Gradients, model)
-        self.state, self.control, self.parameters = (interop.views(held, model) for held in containers)
-        self.gradients = interop.views(arrays, model)
-        self.arrays = tuple(self.gradients)
+        room = OwnArrays(model)
+        self.state, self.control, self.parameters, self.gradients = room.views
+        self.arrays = room.names
         self.names: Sequence[str] = (*STATE, *FRAMES) if model.has_moving_frames else STATE
         memory = (*(CONTACT if model.contact else ()), *(KINEMATIC if model.frames else ()))
         if model.joints is not None:
@@ -158,17 +190,10 @@ class DifferentiableWorlds:
         if model.relaxes:
             self.names = (*self.names, *MEMORIES)
         self.memory = tuple(name for name in memory if name not in self.names)
-        if model.frames is not None:
-            self.state |= interop.frame_aliases(self.state, model, *FRAMES)
-            self.gradients |= interop.frame_aliases(self.gradients, model, *FRAMES)
-            self.control |= interop.force_aliases(self.control, model)
-            named = {"frame_force": self.gradients["command_frame_force"]}
-            for name, view in interop.force_aliases(named, model).items():
-                self.gradients[f"command_{name}"] = view
         self._index = index = AdjointIndex.of(model)
-        self._twins = twins = sim.make_twins(*containers)
+        self._twins = twins = sim.make_twins(*room.worlds)
         steppers = [stepper(system, self.h) for _, system in twins]
-        parts = [worlds_slice(arrays, each.start, each.stop) for each, _ in twins]
+        parts = [room.part(each) for each, _ in twins]
         pulls = [
             _adjoint(each, part, index, rest=rest)
             for each, part in zip(steppers, parts, strict=True)
@@ -194,9 +219,15 @@ class DifferentiableWorlds:
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
         self.pressed = torch.zeros_like(self.state["compression"])
-        self.failed, self.rough, self.lagging = (
-            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(3)
+        self.failed, self.unfinished, self.rough, self.lagging = (
+            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(4)
         )
+        self._adrift = [
+            ((worlds.start, worlds.stop), wp.to_torch(part.adrift, requires_grad=False).flatten())
+            for (worlds, _), pull in zip(twins, pulls, strict=True)
+            for part in (pull.pulls if isinstance(pull, SecondOrderAdjoint) else [pull])
+            if isinstance(part, NewtonAdjoint)
+        ]
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
@@ -212,7 +243,10 @@ class DifferentiableWorlds:
         for name, value in parameters.items():
             self.parameters[name].copy_(value)
         self.failed.zero_()
+        self.unfinished.zero_()
         self.rough.zero_()
+        for _, adrift in self._adrift:
+            adrift.zero_()
         self.lagging.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
@@ -234,7 +268,10 @@ class DifferentiableWorlds:
     def directions(self) -> Directions | RowDirections:
         """What pushes slopes through steps, made when it is first asked for."""
         if self._directions is None and (
-            self.model.has_moving_frames or self.model.relaxes or self.sim.options.integrator != "euler"
+            self.model.has_moving_frames
+            or self.model.relaxes
+            or self.model.membranes is not None
+            or not self.solution_bytes
         ):
             self._directions = RowDirections(self)
         elif self._directions is None:
@@ -258,6 +295,7 @@ class DifferentiableWorlds:
         """Keep what a step tells of trouble."""
         self.pressed.copy_(self.pressed.maximum(self.state["compression"]))
         self.failed.logical_or_(self.state["status"] >= int(Status.NONFINITE))
+        self.unfinished.logical_or_(self.state["status"] == int(Status.MAX_ITERATIONS))
         if self.model.has_kinematic and self.model.has_moving_frames:
             told = self.control["body_velocity"]
             behind = (self.state["body_twist"] - told).abs() > LAG * (1.0 + told.abs().amax())
@@ -265,6 +303,14 @@ class DifferentiableWorlds:
             self.lagging.logical_or_(behind)
         for (begin, end), rough in self._rough:
             self.rough[begin:end].logical_or_(rough[: end - begin] != 0)
+
+    @property
+    def adrift(self) -> torch.Tensor:
+        """Worlds whose gradients did not come to stay since ``start``, bool, (world,)."""
+        found = self.failed.new_zeros(self.failed.shape)
+        for (begin, end), adrift in self._adrift:
+            found[begin:end].logical_or_(adrift[: end - begin] != 0)
+        return found
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
         """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
@@ -320,6 +366,8 @@ def _adjoint(
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
         return SecondOrderAdjoint(steps, gradients, index)
+    if steps.control is not None:
+        return NewtonAdjoint(steps, gradients, index)
     if steps.system.model.joints is not None:
         return JointStepAdjoint(steps.system, steps.h, gradients, index)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint

@@ -54,6 +54,8 @@ class Gradients:
     body_damping: wp.array = batched("rigid", unit="1/s", doc="by the damping of motion")
     joint_stiffness: wp.array = batched("joint", unit="N/m", doc="by the stiffness of a servo [N m/rad]")
     joint_damping: wp.array = batched("joint", unit="N s/m", doc="by its damping [N m s/rad]")
+    membrane_youngs: wp.array = batched("membrane", unit="Pa", doc="by Young's modulus")
+    membrane_nu: wp.array = batched("membrane", doc="by Poisson's ratio")
     rod_youngs: wp.array = batched("rod", unit="Pa", doc="by Young's modulus")
     rod_nu: wp.array = batched("rod", doc="by Poisson's ratio")
     rod_density: wp.array = batched("rod", unit="kg/m^3", doc="by density")
@@ -81,7 +83,7 @@ COMMANDS = (  # after ``command_``
 PARAMETERS = (
     *("youngs", "nu", "density", "rayleigh_mass", "rayleigh_stiffness", "gravity", "law_parameter"),
     *("relaxation_ratio", "relaxation_time"),
-    *("cable_stiffness", "cable_damping", "pair_mu"),
+    *("membrane_youngs", "membrane_nu", "cable_stiffness", "cable_damping", "pair_mu"),
     *("body_mass", "body_damping", "joint_stiffness", "joint_damping"),
     *("rod_youngs", "rod_nu", "rod_density", "rod_rayleigh_mass", "rod_rayleigh_stiffness"),
 )

@@ -19,9 +19,12 @@ from softwarp.solvers.contact_adjoint import ContactAdjoint, contact_solution
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.leaning_adjoint import Leaning, LeaningFrames
+from softwarp.solvers.membrane_adjoint import MembraneAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
+from softwarp.solvers.terms.membranes import MembraneTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
+from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
 
@@ -57,6 +60,7 @@ class StepAdjoint:
     """
 
     predicts = False
+    pace: Pace | None = None  # what a stage of a longer step does of the commands
 
     def __init__(
         self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
@@ -72,12 +76,14 @@ class StepAdjoint:
         self.node_bar = s.rows(3 * m.node_count)
         self.element_v = self.row_v = self.node_v
         self.corner = s.rows(s.work.element_force.real.shape[1])
-        self.tets = self.quadratic = None
+        self.tets = self.quadratic = self.skin = None
         for term in system.terms:
             if isinstance(term, TetTerm):
                 self.tets = TetAdjoint(s, term.tets.tets, m.tet_count)
             elif isinstance(term, QuadraticTerm):
                 self.quadratic = QuadraticAdjoint(s, term.model, term.points.tets, term.first)
+            elif isinstance(term, MembraneTerm):
+                self.skin = MembraneAdjoint(s, term.model)
         self.way, self.point = s.rows(3 * points), s.rows(3 * points)
         self.force, self.q, self.change, self.gap, self.compliant, self.bound, self.measured = (
             s.rows(rows) for _ in range(7)
@@ -143,6 +149,8 @@ class StepAdjoint:
                 term.tets.stiffness()
             elif isinstance(term, QuadraticTerm):
                 term.points.stiffness()
+            elif isinstance(term, MembraneTerm):
+                term.stiffness()
 
     def _find_forces(self) -> None:
         self.system.forces()
@@ -155,7 +163,7 @@ class StepAdjoint:
         system.load(without=without)
         system.scale(self.h)
         system.measure_rows()
-        system.command(self.h)
+        system.command(self.h, self.pace)
         if self.leaning is not None:
             self.leaning.load()
 
@@ -383,6 +391,8 @@ class StepAdjoint:
         if self.leaning is not None:
             self.leaning.velocities(self.node_v)
             self.leaning.push(self.seed, self.q)
+            if self.contact is not None:
+                self.contact.add_forces(self.leaning.pushed)
         if self.frames is not None:
             self.frames.lift(self.element_v, self.node_p)
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
@@ -391,6 +401,8 @@ class StepAdjoint:
         if self.quadratic is not None:
             self.quadratic.pull(*elements, parameters=parameters)
             self.quadratic.add_mass(self.p, self.node_mass_p)
+        if self.skin is not None:
+            self.skin.pull(*elements)
         if not m.row_count:
             return
         inputs = [h, m.point_node, m.point_weight, self.index.point_row, self.row_v.real, self.node_p.real]
@@ -442,6 +454,8 @@ class StepAdjoint:
             self._to_moduli(x.body_tets, self.tets.parameter)
         if self.quadratic is not None:
             self._to_moduli(x.body_points, self.quadratic.points.parameter)
+        if self.skin is not None:
+            self.skin.to_parameters(self.h, g)
         inputs = [*scalars, m.node_count, m.node_body, x.node_heft, i["density"].real, self.node_p.real]
         s.each_real(self.k.gravity, None, inputs, [g.gravity])
         if self.rest is not None:

@@ -33,6 +33,7 @@ class FrameAdjoint:
         lifts: Whether frames carry nodes of soft bodies, whose forces at the start of the step count.
         inertial_v: Velocities of dofs that inertia resists, where joints make these others than those that move things.
         end_v: Velocities that frames move on with after the step, likewise.
+        more_share: Gradients by what compounds are made of that the state behind the step has.
         pose, force_pose: Poses at which what they carry moves with them, and at which forces act on those.
         twist0: Twists whose momentum they have at the start.
         internal: Forces of nodes that elements oppose, without damping.
@@ -53,7 +54,7 @@ class FrameAdjoint:
         self.splits = False  # whether gradients by the velocities that frames move on with go to ``kept`` alone
         self.kept = shard.rows(3 * shard.model.dof_count)
         self.start, self.moved = shard.rows(6 * model.count), shard.rows(of_parts.MOVED_ROWS * model.count)
-        self.share = shard.rows(of_parts.SHARE_ROWS * model.count)
+        self.share, self.more_share = (shard.rows(of_parts.SHARE_ROWS * model.count) for _ in range(2))
         segments = max(self.count, 1)
         self.corner, self.way = shard.rows(12 * segments), shard.rows(12 * segments)
         self.parameter = shard.rows(rod_adjoint.PARAMETERS * segments)
@@ -112,7 +113,7 @@ class FrameAdjoint:
         """
         s, m, g, w = self.shard, self.model, self.gradients, self.shard.work
         spin = m.frame_spin if carries else self.as_solved
-        self.share.zero()
+        self.share.copy_from(self.more_share)
         inputs = [self.h, s.lanes, self.splits, s.model.node_count, m.frame_master, m.frame_offset]
         inputs += [spin, self.gyrates, m.frame_dof, self.item_start, self.item]
         inputs += [m.carried_slot, m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose]
@@ -149,6 +150,7 @@ class FrameAdjoint:
             self.attachments.products.add(
                 kind, w.body_stiffness.S, kind.velocity if of_points else velocity, self.stiff
             )
+        self.attachments.products.add_skin(w.body_stiffness.S, velocity, self.stiff)
 
     def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
         """What carried nodes have goes to their frames; they have no gradients of their own."""

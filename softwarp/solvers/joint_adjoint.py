@@ -21,16 +21,29 @@ from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.frame_adjoint import FrameAdjoint, lists
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.joints import JointTerm
+from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.workspace.rows import Rows, allocate
 
 SHARE, TAKEN, GIVEN, WHOLE = 0, 1, 2, -1  # rows of ``gyration_adjoint.shares``; 1
 
 
 class JointStepAdjoint(StepAdjoint):
-    """Adjoint of a step of a scene with joints; see ``StepAdjoint``."""
+    """Adjoint of a step of a scene with joints; see ``StepAdjoint``.
 
-    def __init__(self, system: System, h: float, gradients: Gradients, index: AdjointIndex) -> None:
+    Args:
+        system: Worlds.
+        h: Step [s].
+        gradients: Arrays of these worlds.
+        index: Of the model.
+        pace: What it does of the commands, where it is a stage of a longer step.
+    """
+
+    def __init__(
+        self, system: System, h: float, gradients: Gradients, index: AdjointIndex, pace: Pace | None = None
+    ) -> None:
         super().__init__(system, h, gradients, index)
+        if pace is not None:
+            self.pace, self.lapse = pace, pace.lapse
         assert self.frames is not None
         joints = next(term for term in system.terms if isinstance(term, JointTerm))
         self.joints = JointAdjoint(self, joints, self.frames)
@@ -39,6 +52,11 @@ class JointStepAdjoint(StepAdjoint):
     def solution(self) -> list[wp.array]:
         """As of ``StepAdjoint``, with all solutions of the step."""
         return [*super().solution, *self.joints.solution]
+
+    def solve_again(self) -> None:
+        """As of ``StepAdjoint``; another stage of the same worlds may have watched the last solve."""
+        self.system.watch = self.joints.keep
+        super().solve_again()
 
     def pull(self, *, parameters: bool = True) -> None:
         """As of ``StepAdjoint``."""
@@ -475,11 +493,12 @@ class JointAdjoint:
     def _to_motors(self) -> None:
         """Gradients by commands, and by the coordinates that they count from."""
         owner, s, m, i, g = self.owner, self.shard, self.term.model, self.shard.input, self.owner.gradients
-        inputs = [self.term.first_row, s.lanes, s.options.recovery_speed, self.h, m.joint_row_start, m.row_kind]
-        inputs += [m.joint_control, m.joint_scale]
+        inputs = [self.term.first_row, s.lanes, s.options.recovery_speed, self.h, owner.lapse]
+        inputs += [m.joint_row_start, m.row_kind, m.joint_control, m.joint_scale]
         inputs += [i[f"command_joint_{name}"].real for name in ("target", "force")]
         names = ("stiffness", "damping", "max_force", "max_rate", "min_position", "max_position")
-        inputs += [i[f"joint_{name}"].real for name in (*names, "position", "reference")]
+        inputs += [i[f"joint_{name}"].real for name in names]
+        inputs += [s.work.joint_position.real, i["joint_reference"].real, s.work.lag.real]
         inputs += [self.mode.real, owner.q.real, owner.bound.real, s.work.multiplier.real]
         outputs = [g.joint_reference, g.command_joint_target, g.command_joint_force]
         outputs += [g.joint_stiffness, g.joint_damping, self.coordinate.real]

@@ -32,6 +32,7 @@ class LeaningFrames(FrameAdjoint):
         lean: e y of dofs.
         mind: Gradients by e y of frames.
         felt_v: Velocities of dofs that inertia resists.
+        ahead: Gradients by the velocities of dofs that a stage is linearised with.
     """
 
     def __init__(self, system: System, model: FrameModel, h: float, gradients: Gradients, *, predicts: bool) -> None:
@@ -40,7 +41,8 @@ class LeaningFrames(FrameAdjoint):
         self.k_felt, self.k_memory = leaning_adjoint.kernels(s.variant), relaxation_adjoint.kernels(s.variant)
         self.term = next((term for term in system.terms if isinstance(term, RelaxationTerm)), None)
         self.predicts = predicts
-        self.start_v, self.lean, self.felt_v = (s.rows(s.dof_room) for _ in range(3))
+        self.start_v, self.lean, self.felt_v, self.ahead = (s.rows(s.dof_room) for _ in range(4))
+        self.follows = 1.0  # whether such a stage is linearised with the velocities of its start
         self.felt = s.rows(leaning_adjoint.FELT_ROWS * max(model.carried_count, 1))
         self.mind, self.early = s.rows(6 * model.count), s.rows(3 * model.count)
         self.inertial_v, self.early_twist = self.felt_v, s.rows(6 * model.count)
@@ -97,13 +99,14 @@ class LeaningFrames(FrameAdjoint):
         inputs = [s.model.node_count, m.welded_frame, m.frame_owner, m.owner_body, m.slot_carried]
         inputs += [w.body_damping.real, self.items.real]
         s.each_real(self.k_felt.welded_felt, m.welded_frame.size, inputs, [self.felt.real])
-        inputs = [self.h, float(self.predicts), s.lanes, s.model.node_count]
+        inputs = [self.h, float(self.predicts), self.follows, s.lanes, s.model.node_count]
         inputs += [m.frame_master, m.frame_spin, m.frame_owner, m.owner_body, m.frame_dof]
         inputs += [self.item_start, self.item, m.carried_slot, m.corner_start, m.corner, self.is_kinematic]
         inputs += [w.body_damping.real, i["pose0"].real, self.start_v.real, self.twist0.real, w.compound.real]
         inputs += [self.felt_v.real, p.real, self.frame_p.real, self.start.real, self.corner.real, self.way.real]
         inputs += [self.items.real, self.felt.real, self.bare.real, self.early.real]
-        outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity, self.mind.real]
+        outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
+        outputs += [self.mind.real, self.ahead.real]
         s.each_real(self.k_felt.frame_gradients, m.count, inputs, outputs)
 
     def _to_sources(self, p: Rows) -> None:
@@ -129,7 +132,7 @@ class Leaning:
     Attributes:
         element_v, row_v: What elements and rows have in the place of the velocities of nodes.
         start_v, lean: Velocities of dofs at the start of a stage, else 0; and e y.
-        pushed: The seed less h H' q.
+        pushed: The seed less h H' q, and less what contacts have likewise.
     """
 
     def __init__(
@@ -146,6 +149,7 @@ class Leaning:
         self.product, self.pushed = s.rows(nodes), s.rows(3 * m.dof_count)
         self.start_v = s.rows(s.dof_room) if frames is None else frames.start_v
         self.lean = s.rows(s.dof_room) if frames is None else frames.lean
+        self.still = s.rows(s.dof_room)
         self.sums = s.rows(relaxation_adjoint.SUM_ROWS * m.body_count)
         self.value = s.rows(2 * max(m.frame_count, 1))
         self.before = wp.zeros_like(gradients.rayleigh_stiffness)
@@ -153,12 +157,10 @@ class Leaning:
 
     def load(self) -> None:
         """Memories at the start of a step; needs the factors of bodies."""
-        term, s, m, i = self.term, self.shard, self.model, self.shard.input
+        term = self.term
         if term is not None:
             term.lean()
-            inputs = [m.node_count, m.body_count, m.dof_node, m.node_body, term.lean_share.real]
-            inputs += [i["node_memory"].real, i["frame_memory"].real]
-            s.each_real(self.k.lean, m.dof_count, inputs, [self.lean.real])
+            term.lean_dofs(self.still, self.lean)
 
     def seed(self, seed: Rows, y: Rows) -> None:
         """Add what memories at the end of the step have by velocities to both right-hand sides."""

@@ -12,7 +12,7 @@ import warp as wp
 
 from softwarp.kernels.rows import look_adjoint
 from softwarp.model import memory
-from softwarp.model.gradients import FRAMES, STATE, Gradients
+from softwarp.model.gradients import FRAMES, MEMORIES, STATE, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.system import System
@@ -109,7 +109,7 @@ class LookStepAdjoint(StepAdjoint):
         self.ahead = s.rows(3 * self.contacts.capacity)
         self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
         g = gradients
-        names = [*STATE, *FRAMES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
+        names = [*STATE, *FRAMES, *MEMORIES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
         parts = [(name, getattr(g, name)) for name in names]
         self.sums = {
             name: (part, *(wp.zeros(part.shape, dtype=part.dtype, device=s.device) for _ in range(2)))

@@ -9,16 +9,21 @@ from softwarp.gradients import Rollout
 from tests.gradient_cases import cube, gradients, inputs, weights
 
 QUADRATIC: dict[str, Any] = {"quadratic": True, "elastic": True}
+NEWTON: dict[str, Any] = {"newton_iterations": 30}
 PATHS = [
     pytest.param({"solver_path": "scalar"}, "float32", "cpu", id="scalar"),
     pytest.param({"solver_path": "lanes"}, "float32", "cpu", id="lanes"),
     pytest.param({"solver_path": "scalar"}, "float64", "cpu", id="float64", marks=pytest.mark.slow),
     pytest.param({"solver_path": "lanes", "integrator": "bdf2"}, "float32", "cpu", id="second_order"),
+    pytest.param({"covered": True, "solver_path": "lanes"}, "float32", "cpu", id="skin"),
+    pytest.param(NEWTON | {"solver_path": "lanes"}, "float32", "cpu", id="newton"),
+    pytest.param(NEWTON | {"solver_path": "scalar"}, "float64", "cpu", id="newton_float64", marks=pytest.mark.slow),
     pytest.param(QUADRATIC | {"solver_path": "lanes"}, "float32", "cpu", id="quadratic", marks=pytest.mark.slow),
     pytest.param({"solver_path": "panels"}, "float32", "cuda:0", id="panels", marks=pytest.mark.cuda),
     pytest.param(
         QUADRATIC | {"solver_path": "panels"}, "float32", "cuda:0", id="quadratic_cuda", marks=pytest.mark.cuda
     ),
+    pytest.param(NEWTON | {"solver_path": "levels"}, "float64", "cuda:0", id="newton_cuda", marks=pytest.mark.cuda),
     pytest.param(
         {"solver_path": "levels", "integrator": "bdf2"}, "float64", "cuda:0", id="levels", marks=pytest.mark.cuda
     ),

@@ -12,6 +12,8 @@ from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements import rod_adjoint
 from softwarp.kernels.frames import adjoint as of_frames
+from softwarp.kernels.frames import momentum, top_adjoint
+from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.model.codes import Spin
 
 
@@ -22,6 +24,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("adjoint.extrapolated")
     one = single.functions(variant)
     vec3, quat, exponential, logarithm = one.vec3, one.quat, one.exponential, one.logarithm
+    vector_at, inertia_at = one.vector_at, one.inertia_at
+    inertia_inverse = momentum.functions(variant).inertia_inverse
+    tops = top_adjoint.functions(variant)
+    about_centre, drifted, pull_extrapolated = tops.about_centre, tops.drifted, tops.pull_extrapolated
     turns, of_rods = of_frames.functions(variant), rod_adjoint.functions(variant)
     turn_bar, jacobian_transposed = turns.turn_bar, turns.jacobian_transposed
     slopes, twisted = of_rods.slopes, of_rods.twisted
@@ -87,4 +93,97 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 put_turn(pose_bar_out, world, row + 3, q1, by_end)
                 put_turn(pose_rest_out, world, row + 3, q0, by_start)
 
-    return SimpleNamespace(part_frames=part_frames)
+    @wp.func
+    def of_world(array: wp.array2d(dtype=real), world: int, row: int):
+        """Vector in three rows of a state array."""
+        return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
+
+    @wp.func
+    def put_twist(bar: wp.array2d(dtype=real), world: int, row: int, linear: vec3, angular: vec3):
+        """Gradients by velocity and spin."""
+        for c in range(3):
+            bar[world, row + c] = linear[c]
+            bar[world, row + 3 + c] = angular[c]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def part_tops(
+        factor: real,
+        lapse: real,
+        lanes: int,
+        # Model
+        frame_master: wp.array(dtype=wp.int32),
+        frame_spin: wp.array(dtype=wp.int32),
+        # State
+        pose0_in: wp.array2d(dtype=real),
+        twist0_in: wp.array2d(dtype=real),
+        pose1_in: wp.array2d(dtype=real),
+        twist1_in: wp.array2d(dtype=real),
+        # Workspace in
+        compound_in: wp.array3d(dtype=real),
+        # State out
+        pose_bar_out: wp.array2d(dtype=real),
+        twist_bar_out: wp.array2d(dtype=real),
+        pose_rest_out: wp.array2d(dtype=real),
+        twist_rest_out: wp.array2d(dtype=real),
+        # Workspace out
+        share_out: wp.array3d(dtype=real),
+    ):
+        """The same of one free top, which keeps its momenta and turns freely; see ``momentum.extrapolate_tops``.
+
+        ``share`` receives the gradients by what it is made of.
+        """
+        pack, frame, lane = wp.tid()
+        world = pack * lanes + lane
+        k = wp.static(COMPOUND_ROWS) * frame
+        m = compound_in[pack, k, lane]
+        is_master = world < pose_bar_out.shape[0] and frame_master[frame] == frame
+        if is_master and frame_spin[frame] == wp.static(Spin.FREE_TOP) and m > real(0.0):
+            row = 7 * frame
+            t = 6 * frame
+            q0 = quat()
+            q1 = quat()
+            for c in range(4):
+                q0[c] = pose0_in[world, row + 3 + c]
+                q1[c] = pose1_in[world, row + 3 + c]
+            V0 = of_world(twist0_in, world, t)
+            w0 = of_world(twist0_in, world, t + 3)
+            V1 = of_world(twist1_in, world, t)
+            w1 = of_world(twist1_in, world, t + 3)
+            centre, J = about_centre(
+                m, vector_at(compound_in, pack, lane, k + 1), inertia_at(compound_in, pack, lane, k + 4)
+            )
+            q, _ = drifted(q0, w0, q1, w1, J, inertia_inverse(J), factor, lapse)
+            by_x = of_world(pose_bar_out, world, row)
+            by_turn = turn_of(pose_bar_out, world, row + 3, q)
+            by_v = of_world(twist_bar_out, world, t)
+            by_w = of_world(twist_bar_out, world, t + 3)
+            turn0, v0, s0, turn1, v1, s1 = pull_extrapolated(
+                q0,
+                V0,
+                w0,
+                q1,
+                V1,
+                w1,
+                centre,
+                J,
+                factor,
+                lapse,
+                by_x,
+                by_turn,
+                by_v,
+                by_w,
+                m,
+                share_out,
+                pack,
+                lane,
+                frame,
+            )
+            for c in range(3):
+                pose_bar_out[world, row + c] = factor * by_x[c]
+                pose_rest_out[world, row + c] = by_x[c] - factor * by_x[c]
+            put_turn(pose_bar_out, world, row + 3, q1, turn1)
+            put_turn(pose_rest_out, world, row + 3, q0, turn0)
+            put_twist(twist_bar_out, world, t, v1, s1)
+            put_twist(twist_rest_out, world, t, v0, s0)
+
+    return SimpleNamespace(part_frames=part_frames, part_tops=part_tops)

@@ -49,30 +49,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return vec3(offset[item, 0], offset[item, 1], offset[item, 2])
 
     @wp.kernel(module=module, enable_backward=False)
-    def lean(
-        node_count: int,
-        bodies: int,
-        # Model
-        dof_node: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        # Workspace in
-        lean_in: wp.array3d(dtype=real),
-        node_memory_in: wp.array3d(dtype=real),
-        frame_memory_in: wp.array3d(dtype=real),
-        # Workspace out
-        lean_out: wp.array3d(dtype=real),
-    ):
-        """e y of one dof."""
-        pack, dof, lane = wp.tid()
-        slot = dof_node[dof]
-        for c in range(3):
-            if slot < node_count:
-                y = lean_in[pack, node_body[slot], lane] * node_memory_in[pack, 3 * slot + c, lane]
-            else:
-                y = lean_in[pack, bodies, lane] * frame_memory_in[pack, 3 * (slot - node_count) + c, lane]
-            lean_out[pack, 3 * dof + c, lane] = y
-
-    @wp.kernel(module=module, enable_backward=False)
     def velocities(
         body_nodes: int,
         # Model
@@ -389,6 +365,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def frame_gradients(
         h: real,
         predicts: real,
+        follows: real,
         lanes: int,
         nodes: int,
         # Model
@@ -426,11 +403,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         velocity_bar_out: wp.array2d(dtype=real),
         # Workspace out
         memory_out: wp.array3d(dtype=real),
+        ahead_out: wp.array3d(dtype=real),
     ):
         """As ``adjoint.frame_gradients``, and in ``memory`` the gradient by e y, of one frame.
 
-        ``predicts`` is 1 in a stage, where segments and items act at the pose that start velocities lead to, else 0;
-        forces on a free top act at that of the start. ``start_v_in`` are velocities of dofs in a stage.
+        ``predicts`` is 1 in a stage, where segments and items act at the pose that ``start_v_in`` lead to, velocities
+        of dofs, else 0; forces on a free top act at that of the start. ``follows`` is 1 if these velocities are those
+        of the start; ``ahead`` receives the gradients by them.
         """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane
@@ -498,17 +477,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 early_w += vector_at(felt_in, pack, lane, row + 3)
                 mind_v += vector_at(felt_in, pack, lane, row + 6)
                 mind_w += vector_at(felt_in, pack, lane, row + 9)
+            phi = predicts * h * vector_at(start_v_in, pack, lane, r)
+            ahead_v = predicts * (h * place + early_v)
+            ahead_w = predicts * (h * jacobian_transposed(phi, turn) + early_w)
+            put(ahead_out, pack, lane, t, ahead_v)
+            put(ahead_out, pack, lane, r, ahead_w)
             if 6 * frame < velocity_bar_out.shape[1]:
+                linear += (real(1.0) - follows) * ahead_v
+                angular += (real(1.0) - follows) * ahead_w
                 for c in range(3):
                     velocity_bar_out[world, 6 * frame + c] = is_kinematic[frame] * linear[c]
                     velocity_bar_out[world, 6 * frame + 3 + c] = is_kinematic[frame] * angular[c]
-            phi = predicts * h * vector_at(start_v_in, pack, lane, r)
             turn0 += wp.quat_rotate_inv(exponential(phi), turn)
             turn0 += by_turn(s, J, pt, pr, V0, w0) - by_turn(lost, damped, pt, pr, V, w)
             by_q = quat(turn0[0], turn0[1], turn0[2], real(0.0)) * q * real(2.0)
             linear, angular = momentum(m, s, J, pt, pr)
-            by_v = linear + predicts * (h * place + early_v)
-            by_w = angular + predicts * (h * jacobian_transposed(phi, turn) + early_w)
+            by_v = linear + follows * ahead_v
+            by_w = angular + follows * ahead_w
             ratio = real(1.0)
             if m > real(0.0):
                 ratio = compound_in[pack, k + 10, lane] / m
@@ -526,7 +511,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 pose_bar_out[world, 7 * frame + 3 + c] = by_q[c]
 
     return SimpleNamespace(
-        lean=lean,
         velocities=velocities,
         carried_velocities=carried_velocities,
         twists=twists,

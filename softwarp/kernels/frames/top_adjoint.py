@@ -1,4 +1,4 @@
-"""Adjoint of how a free top moves on. Theory: docs/theory/adjoint.md.
+"""Adjoint of how a free top moves on, and is extrapolated between stages. Theory: docs/theory/adjoint.md.
 
 A free top has the angular momentum L = R J R' w about its centre of mass c, which the step keeps. From its velocities
 (V, w) and its orientation q0 follow, with the classical Runge-Kutta method for q,
@@ -65,6 +65,13 @@ def functions(variant: Variant) -> SimpleNamespace:
         return centre, J - m * (square - wp.outer(centre, centre))
 
     @wp.func
+    def turn_of(q: quat, by_q: quat):
+        """Gradient by a turn from that by a quaternion."""
+        u = vec3(q[0], q[1], q[2])
+        by_u = vec3(by_q[0], by_q[1], by_q[2])
+        return real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - by_q[3] * u)
+
+    @wp.func
     def pull(
         q0: quat,
         V: vec3,
@@ -94,9 +101,79 @@ def functions(variant: Variant) -> SimpleNamespace:
         )
         by_J = gJ - wp.transpose(inverse) * gi * wp.transpose(inverse)
         add_share(share, pack, lane, frame, m, centre, gc, real(0.5) * (by_J + wp.transpose(by_J)))
-        u = vec3(q0[0], q0[1], q0[2])
-        by_u = vec3(g0[0], g0[1], g0[2])
-        return real(0.5) * (q0[3] * by_u + wp.cross(u, by_u) - g0[3] * u), gV, gw
+        return turn_of(q0, g0), gV, gw
+
+    @wp.func
+    def drifted(q0: quat, w0: vec3, q1: quat, w1: vec3, J: mat33, inverse: mat33, factor: real, lapse: real):
+        """Orientation and angular velocity that a free top is extrapolated to."""
+        L0 = turned(q0, J, w0)
+        L1 = turned(q1, J, w1)
+        q = free_top(q1, L1, inverse, lapse)
+        return q, turned(q, inverse, L0 + factor * (L1 - L0))
+
+    @wp.func
+    def extrapolated(
+        q0: quat,
+        V0: vec3,
+        w0: vec3,
+        q1: quat,
+        V1: vec3,
+        w1: vec3,
+        centre: vec3,
+        J: mat33,
+        inverse: mat33,
+        factor: real,
+        lapse: real,
+        by_x: vec3,
+        by_q: quat,
+        by_v: vec3,
+        by_w: vec3,
+    ):
+        """What a free top is extrapolated to, but for its places, in weights of the results."""
+        q, w = drifted(q0, w0, q1, w1, J, inverse, factor, lapse)
+        s0 = turn(q0, centre, real(1.0))
+        s1 = turn(q1, centre, real(1.0))
+        s = turn(q, centre, real(1.0))
+        V = V0 + wp.cross(w0, s0)
+        V += factor * (V1 + wp.cross(w1, s1) - V) - wp.cross(w, s)
+        total = wp.dot(by_x, s0 + factor * (s1 - s0) - s) + wp.dot(by_q, q)
+        return total + wp.dot(by_v, V) + wp.dot(by_w, w)
+
+    @wp.func
+    def pull_extrapolated(
+        q0: quat,
+        V0: vec3,
+        w0: vec3,
+        q1: quat,
+        V1: vec3,
+        w1: vec3,
+        centre: vec3,
+        J: mat33,
+        factor: real,
+        lapse: real,
+        by_x: vec3,
+        by_turn: vec3,
+        by_v: vec3,
+        by_w: vec3,
+        m: real,
+        share: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        frame: int,
+    ):
+        """Gradients by turn and twist at both states that a free top is extrapolated from, beside those by places.
+
+        Those by what the compound of mass m is made of are added to its ``share``.
+        """
+        inverse = inertia_inverse(J)
+        q, _ = drifted(q0, w0, q1, w1, J, inverse, factor, lapse)
+        by_q = quat(by_turn[0], by_turn[1], by_turn[2], real(0.0)) * q * real(2.0)
+        g0, gV0, gw0, g1, gV1, gw1, gc, gJ, gi, gf, gl, gx, gq, gv, gw = wp.grad(extrapolated)(
+            q0, V0, w0, q1, V1, w1, centre, J, inverse, factor, lapse, by_x, by_q, by_v, by_w
+        )
+        by_J = gJ - wp.transpose(inverse) * gi * wp.transpose(inverse)
+        add_share(share, pack, lane, frame, m, centre, gc, real(0.5) * (by_J + wp.transpose(by_J)))
+        return turn_of(q0, g0), gV0, gw0, turn_of(q1, g1), gV1, gw1
 
     @wp.kernel(module=variant.module("adjoint.frames"), enable_backward=True)
     def reach(
@@ -115,4 +192,29 @@ def functions(variant: Variant) -> SimpleNamespace:
         m = matrix_in[sample]
         value_out[sample] = value(q, a, a, a, m, m, h, a, q, a, a)
 
-    return SimpleNamespace(moved=moved, about_centre=about_centre, pull=pull, reach=reach)
+    @wp.kernel(module=variant.module("adjoint.extrapolated"), enable_backward=True)
+    def reach_extrapolated(
+        # Samples in
+        vector_in: wp.array(dtype=vec3),
+        turn_in: wp.array(dtype=quat),
+        matrix_in: wp.array(dtype=mat33),
+        h: real,
+        # Samples out
+        value_out: wp.array(dtype=real),
+    ):
+        """The same of ``extrapolated``."""
+        sample = wp.tid()
+        a = vector_in[sample]
+        q = turn_in[sample]
+        m = matrix_in[sample]
+        value_out[sample] = extrapolated(q, a, a, q, a, a, a, m, m, h, h, a, q, a, a)
+
+    return SimpleNamespace(
+        moved=moved,
+        about_centre=about_centre,
+        pull=pull,
+        drifted=drifted,
+        pull_extrapolated=pull_extrapolated,
+        reach=reach,
+        reach_extrapolated=reach_extrapolated,
+    )

@@ -190,6 +190,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         recovery: real,
         h: real,
+        lapse: real,
         # Model
         joint_row_start: wp.array(dtype=wp.int32),
         row_kind: wp.array(dtype=wp.int32),
@@ -206,6 +207,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         max_position_in: wp.array3d(dtype=real),
         position0_in: wp.array3d(dtype=real),
         reference0_in: wp.array3d(dtype=real),
+        lag_in: wp.array3d(dtype=real),
         mode_in: wp.array3d(dtype=wp.int32),
         q_in: wp.array3d(dtype=real),
         bound_bar_in: wp.array3d(dtype=real),
@@ -258,7 +260,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         by_q -= q * (kp / total) * scale
                         if not is_rigid:
                             by_force += q * scale / total
-                            inner = wp.clamp(command, start - rate * h, start + rate * h)
+                            inner = wp.clamp(command, start - rate * lapse, start + rate * lapse)
                             way = wp.clamp(inner, low, high) - at
                             force = multiplier_in[pack, first_row + row, lane] * scale
                             force -= force_command_in[pack, joint, lane]
@@ -266,12 +268,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             if kp + damping_in[pack, joint, lane] / h > real(wp.static(NO_STIFFNESS)):
                                 by_stiffness += share * (way * (total - kp) + force)
                                 by_damping += share * (force - way * kp) / h
+                    lag = real(0.0)
+                    most = rate * lapse
                     if is_rigid:
                         start = at
-                    inner = wp.clamp(command, start - rate * h, start + rate * h)
+                        most = rate * h
+                        lag = lag_in[pack, 0, lane]
+                        command = command - lag * (command - at)
+                    inner = wp.clamp(command, start - most, start + most)
                     if inner >= low and inner <= high:
                         if inner == command:
-                            by_target += by_reference
+                            by_target += by_reference - lag * by_reference
+                            by_q += lag * by_reference
                         elif is_rigid:
                             by_q += by_reference
                         else:

@@ -78,6 +78,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def nodes(
         h: real,
+        follows: real,
         lanes: int,
         # Model
         node_dof: wp.array(dtype=wp.int32),
@@ -100,10 +101,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         x_bar_out: wp.array2d(dtype=real),
         v_bar_out: wp.array2d(dtype=real),
         force_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        ahead_out: wp.array3d(dtype=real),
     ):
         """Gradients by the position, the velocity and the force of one node at the start of the stage.
 
-        ``node_bar_in`` is that by x, ``pushed_in`` s of dofs, ``point_bar_in`` that by points at the start.
+        ``node_bar_in`` is that by x, ``pushed_in`` s of dofs, ``point_bar_in`` that by points at the start; ``ahead``
+        receives those by the velocities that the stage is linearised with, which ``follows`` is 1 for if they are
+        those of the start.
         """
         pack, node, lane = wp.tid()
         world = pack * lanes + lane
@@ -124,7 +129,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 row = 3 * node + c
                 found = mass_p[c]
                 if dof >= 0:
-                    found += by_v[c] * dof_free[dof, c]
+                    found += follows * by_v[c] * dof_free[dof, c]
+                    ahead_out[pack, 3 * dof + c, lane] = by_v[c]
                 x_bar_out[world, row] = x_bar_out[world, row] + by_x[c]
                 v_bar_out[world, row] = found
                 force_bar_out[world, row] = h * node_p_in[pack, row, lane]

@@ -59,6 +59,14 @@ class Products:
             inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_damping
         s.each(kernel, kind.lists[0].size, [*inputs, factor, kind.kept.S, velocity.S], [out.S])
 
+    def add_skin(self, factor: wp.array, velocity: Rows, out: Rows) -> None:
+        """The same of membranes, if there are any; their corners are nodes."""
+        s, w, skin = self.shard, self.shard.work, self.shard.model.membranes
+        if skin is not None:
+            inputs = [skin.element_body, skin.tri_node, skin.held_node, skin.held_start, skin.held_entry]
+            inputs += [skin.held_weight, factor, w.membrane_stiffness.S, velocity.S]
+            s.each(self.k.stored_damping, skin.held_node.size, inputs, [out.S])
+
 
 class AttachmentTerm(Term):
     """Stiffness and damping of elements whose corners frames carry.
@@ -113,8 +121,4 @@ class AttachmentTerm(Term):
         beta = s.felt["beta"].S
         for kind in self.held:
             self.products.add(kind, beta, kind.velocity, w.node_internal)
-        skin = s.model.membranes
-        if skin is not None:
-            inputs = [skin.element_body, skin.tri_node, skin.held_node, skin.held_start, skin.held_entry]
-            inputs += [skin.held_weight, beta, w.membrane_stiffness.S, w.slot_v.S]
-            s.each(self.k.stored_damping, skin.held_node.size, inputs, [w.node_internal.S])
+        self.products.add_skin(beta, w.slot_v, w.node_internal)

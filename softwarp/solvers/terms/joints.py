@@ -62,12 +62,16 @@ class JointTerm(Term):
         s.each_real(self.k.joint_rows, m.rows, inputs, [w.displacement.real, w.row.real])
 
     def command(self, h: float, pace: Pace) -> None:
-        """Targets, bounds and compliances of all rows."""
+        """Targets, bounds and compliances of all rows; needs ``measure`` at the start.
+
+        That measures where an extrapolation has led between two stages, too.
+        """
         s, m, i, w = self.shard, self.model, self.shard.input, self.shard.work
         inputs = [self.first_row, m.row_joint, m.row_kind, m.joint_control, m.joint_scale]
         inputs += [i[f"command_joint_{name}"].real for name in ("target", "force")]
         names = ("stiffness", "damping", "max_force", "max_rate", "min_position", "max_position")
-        inputs += [i[f"joint_{name}"].real for name in (*names, "position", "reference")]
+        inputs += [i[f"joint_{name}"].real for name in names]
+        inputs += [w.joint_position.real, i["joint_reference"].real]
         outputs = [w.target.real, w.lower_bound.real, w.upper_bound.real, w.compliance.real]
         outputs += [w.floor.real, w.ceiling.real, w.joint_reference.real]
         inputs += [w.lag.real, s.options.recovery_speed, h, pace.lapse]

@@ -29,10 +29,15 @@ class MembraneTerm(Term):
         s = self.shard
         s.each(self.k.triangle_force, self.count, self._inputs(s.model.tet_count), [s.work.element_force.S])
 
+    def stiffness(self) -> None:
+        """That of all triangles."""
+        s = self.shard
+        s.each(self.k.triangle_stiffness, self.count, self._inputs(0), [s.work.membrane_stiffness.S])
+
     def tangent(self, h: float) -> None:
         """Stiffness of all triangles, those at nodes that frames carry among them."""
         s, m, w = self.shard, self.model, self.shard.work
-        s.each(self.k.triangle_stiffness, self.count, self._inputs(0), [w.membrane_stiffness.S])
+        self.stiffness()
         inputs = [m.element_body, m.membrane_entry_start, m.membrane_entry]
         inputs += [w.body_stiffness.S, w.membrane_stiffness.S]
         s.each(self.k_gather.block_stiffness, s.blocks, inputs, [w.a.S])

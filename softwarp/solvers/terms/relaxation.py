@@ -48,8 +48,14 @@ class RelaxationTerm(Term):
         s.each_real(self.k.lean_nodes, m.body_node_count, inputs, [felt["v0"].real])
         inputs = [self.bodies, share, w.compound.real, i["twist0"].real, memory[1]]
         s.each_real(self.k.lean_frames, self.frames, inputs, [felt["twist0"].real])
-        inputs = [m.node_count, self.bodies, m.dof_node, m.node_body, share, *memory, w.dof_v.real]
-        s.each_real(self.k.lean_dofs, m.dof_count, inputs, [felt["dof_v"].real])
+        self.lean_dofs(w.dof_v, felt["dof_v"])
+
+    def lean_dofs(self, dof_v: Rows, leaning: Rows) -> None:
+        """Velocities of dofs with the memories that act beside them."""
+        s, m, i = self.shard, self.shard.model, self.shard.input
+        inputs = [m.node_count, self.bodies, m.dof_node, m.node_body, self.lean_share.real]
+        inputs += [i["node_memory"].real, i["frame_memory"].real, dof_v.real]
+        s.each_real(self.k.lean_dofs, m.dof_count, inputs, [leaning.real])
 
     def check(self, h: float) -> None:
         """Memories at the end of the step."""

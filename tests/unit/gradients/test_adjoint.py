@@ -82,6 +82,21 @@ def test_gradients_of_the_exact_tangent() -> None:
     check(Rollout(sim), inputs(sim, [1], 0.3), weights(sim))
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"project_tangent": False}, marks=pytest.mark.slow),
+        pytest.param({"integrator": "bdf2", "locked": False}, marks=pytest.mark.slow),
+        pytest.param({"newton_iterations": 60, "newton_tolerance": 1e-13}, marks=pytest.mark.slow),
+    ],
+)
+def test_membranes(options: dict[str, Any]) -> None:
+    """By their moduli, and by all that stretches and presses them; the negative part of their stress is not in A."""
+    sim = cube("nh_log", covered=True, **options)
+    check(Rollout(sim), inputs(sim, [1]), weights(sim))
+
+
 def test_some_tangents_are_projected() -> None:
     """The strained state of these tests has clamped elements, or they would prove nothing about the projection."""
     ends = []

@@ -17,15 +17,22 @@ OPEN, STUCK, SLIPPING = range(3)
 
 
 def block(
-    mu: float, num_worlds: int = 1, precision: str = "float64", device: str = "cpu", **laws: float
+    mu: float,
+    num_worlds: int = 1,
+    precision: str = "float64",
+    device: str = "cpu",
+    *,
+    memory: tuple[float, float] = (0.0, 0.0),
+    **laws: float,
 ) -> sw.Simulation:
-    """A cube with a cable on a floor that a kinematic body is."""
+    """A cube with a cable, and perhaps a Maxwell branch, on a floor that a kinematic body is."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     body = builder.add_tets(
         meshing.box((SIDE, SIDE, SIDE), (2, 2, 2)),
         material=sw.Corotational(1e5, 0.4),
         density=1e3,
         rayleigh=(0.5, 0.01),
+        relaxation=memory,
     )
     builder.add_cable(body, [(0.02, 0.05, 0.03), (0.05, 0.04, 0.05), (0.08, 0.05, 0.07)], control="force")
     floor = builder.add_rigid(sw.Plane(), kinematic=True, name="floor")

@@ -63,6 +63,20 @@ def test_joints_and_motors(motor: str) -> None:
 
 
 @SLOW
+def test_membranes() -> None:
+    """Triangles on a cube's surface; by rows."""
+    sim = cube("nh_log", covered=True)
+    compare(Rollout(sim), inputs(sim, [1]), weights(sim))
+
+
+@SLOW
+def test_joints_in_steps_of_second_order() -> None:
+    """Stages beside joints."""
+    sim = test_joints.arm("slow", integrator="bdf2")
+    compare(Rollout(sim), test_joints.thrown(sim, [1]), test_joints.loss)
+
+
+@SLOW
 @pytest.mark.parametrize("options", [{"kind": "slider"}, {"kind": "ball"}, {"base": "rod"}, {"base": "kinematic"}])
 def test_other_joints_and_bases(options: dict[str, Any]) -> None:
     """Rows of other kinds, on what moves."""

@@ -12,6 +12,7 @@ from softwarp.gradients import Rollout
 from tests.cases import material
 from tests.gradient_cases import STEPS, Inputs, gradients
 from tests.unit.gradients.test_bodies import loss
+from tests.unit.gradients.test_contact import EXACT
 from tests.unit.gradients.test_rigid import bodies
 from tests.unit.gradients.test_rods import check
 
@@ -57,6 +58,7 @@ def arm(
     *,
     soft: bool = False,
     base: str = "world",
+    integrator: str = "euler",
 ) -> sw.Simulation:
     """Two links, the first on a hinge; the second one may carry a soft finger.
 
@@ -67,6 +69,7 @@ def arm(
         precision: Of the model.
         soft: Put the finger on.
         base: What the first link hangs from: the world, a moving base or the free end of a rod.
+        integrator: Of the simulation.
     """
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
     shape = sw.Box((0.1, 0.03, 0.02))
@@ -96,7 +99,7 @@ def arm(
         )
         builder.attach(finger, box=((0.19, -1, -1), (0.2 + 1e-6, 1, 1)), to=lower)
     model = builder.finalize(num_worlds=num_worlds, precision=precision)  # type: ignore[arg-type]
-    return sw.Simulation(model, dt=0.01)
+    return sw.Simulation(model, dt=0.01, integrator=integrator, **({} if integrator == "euler" else EXACT))  # type: ignore[arg-type]
 
 
 def thrown(sim: sw.Simulation, seeds: list[int]) -> Inputs:
@@ -231,6 +234,35 @@ def test_worlds_and_kept_factors_change_no_bit() -> None:
         alone = gradients(Rollout(single), thrown(single, [seed]), loss, steps=STEPS)
         for name, value in alone["state"].items():
             assert torch.equal(plain["state"][name][world], value[0]), name
+
+
+@pytest.mark.parametrize(
+    ("motor", "options"),
+    [
+        ("slow", {}),
+        *(pytest.param(motor, {}, marks=SLOW) for motor in MOTORS if motor != "slow"),
+        *(pytest.param("servo", {"kind": kind}, marks=SLOW) for kind in ("slider", "ball", "weld")),
+        pytest.param("servo", {"base": "kinematic"}, marks=SLOW),
+        pytest.param("servo", {"base": "rod", "soft": True}, marks=SLOW),
+    ],
+)
+def test_steps_of_second_order(motor: str, options: dict[str, Any]) -> None:
+    """Two stages that are linearised where they start, and motors that go part of their way in each."""
+    sim = arm(motor, integrator="bdf2", **options)
+    parameters = SIZES["parameters"] | {"body_mass": 1e-4, "joint_damping": 1e-3, "density": 1.0}  # hardly count
+    check(Rollout(sim), thrown(sim, [1]), loss, {**SIZES, "parameters": parameters})
+
+
+def test_worlds_beside_change_no_bit_of_steps_of_second_order() -> None:
+    """A batch has the gradients of each world alone."""
+    batch, single = arm("weak", num_worlds=2, integrator="bdf2"), arm("weak", integrator="bdf2")
+    together = gradients(Rollout(batch), thrown(batch, [1, 2]), loss, steps=STEPS)
+    for world, seed in enumerate((1, 2)):
+        alone = gradients(Rollout(single), thrown(single, [seed]), loss, steps=STEPS)
+        for name, value in alone["state"].items():
+            assert torch.equal(together["state"][name][world], value[0]), name
+        for name, value in alone["controls"].items():
+            assert torch.equal(together["controls"][name][:, world], value[:, 0]), name
 
 
 @SLOW

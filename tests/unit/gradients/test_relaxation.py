@@ -11,7 +11,7 @@ from softwarp import meshing
 from softwarp.gradients import Equilibrium, Rollout
 from tests.cases import material
 from tests.gradient_cases import STEPS, Inputs, gradients
-from tests.unit.gradients import test_rigid
+from tests.unit.gradients import test_adjoint, test_contact, test_rigid
 from tests.unit.gradients.test_forward_frames import compare
 from tests.unit.gradients.test_rods import check
 
@@ -89,10 +89,18 @@ def test_gradients_are_those_of_differences(base: str, integrator: str, options:
     check(Rollout(sim), given, test_rigid.loss, SIZES)
 
 
-@pytest.mark.parametrize("integrator", ["bdf2", pytest.param("euler", marks=pytest.mark.slow)])
-def test_both_modes_agree(integrator: str) -> None:
-    """The forward mode has slopes of memories too."""
-    sim = beam(integrator=integrator, quadratic=False)
+@pytest.mark.parametrize(
+    ("integrator", "quadratic"),
+    [
+        ("bdf2", True),
+        pytest.param("bdf2", False, marks=pytest.mark.slow),
+        pytest.param("euler", False, marks=pytest.mark.slow),
+        pytest.param("euler", True, marks=pytest.mark.slow),
+    ],
+)
+def test_both_modes_agree(integrator: str, quadratic: bool) -> None:
+    """The forward mode has slopes of memories too, and of quadratic elements that are carried."""
+    sim = beam(integrator=integrator, quadratic=quadratic)
     compare(Rollout(sim), given_of(sim, [1]), test_rigid.loss)
 
 
@@ -111,6 +119,26 @@ def test_worlds_beside_change_no_bit(integrator: str) -> None:
         kept = gradients(Rollout(batch), given_of(batch, seeds), test_rigid.loss, steps=STEPS, factors=True)
         for group, held in kept.items():
             assert all(torch.equal(together[group][name], value) for name, value in held.items())
+
+
+def test_a_cube_that_touches_a_floor() -> None:
+    """By ratio and time too; of a batch each world's alone, whether factors are kept or not."""
+    batch, single = (test_contact.block(0.5, worlds, memory=(0.3, 0.02)) for worlds in (2, 1))
+
+    def given(sim: sw.Simulation, seeds: tuple[int, ...]) -> Inputs:
+        found = test_contact.thrown(sim, 0.3, seeds)
+        for name in ("relaxation_ratio", "relaxation_time"):
+            found["parameters"][name] = getattr(sim.params, name).clone()
+        return found
+
+    rollout = Rollout(single)
+    test_adjoint.check(rollout, given(single, (1,)), test_contact.loss)
+    together = gradients(Rollout(batch), given(batch, (1, 2)), test_contact.loss, factors=True)
+    for world, seed in enumerate((1, 2)):
+        alone = gradients(rollout, given(single, (seed,)), test_contact.loss)
+        for group in ("state", "parameters"):
+            for name, value in alone[group].items():
+                assert torch.equal(together[group][name][world], value[0]), (group, name)
 
 
 def test_equilibria_of_carried_beams() -> None:

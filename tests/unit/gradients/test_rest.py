@@ -11,6 +11,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.gradients import Equilibrium, Rollout
 from tests.cases import material
+from tests.gradient_cases import cube
 from tests.unit.gradients.test_equilibrium import beam
 
 MESH = meshing.box((0.1, 0.04, 0.04), (3, 1, 1))
@@ -89,3 +90,7 @@ def test_refusals() -> None:
         Equilibrium(sim, rest=True)(parameters={"rest_x": 1.1 * shape})
     with pytest.raises(ValueError, match="'rest_x' has no gradient"):
         Equilibrium(sim)(parameters={"rest_x": shape})
+    with pytest.raises(ValueError, match="membrane 'membrane0' has no gradient by the rest shape yet"):
+        Rollout(cube(covered=True), rest=True)
+    with pytest.raises(ValueError, match="equilibria with membrane 'membrane0' have no gradient yet"):
+        Equilibrium(cube(covered=True))
