@@ -18,6 +18,7 @@ from softwarp.kernels.rows import looks
 from softwarp.model import memory
 from softwarp.model.codes import FAR, CoupleColumn
 from softwarp.model.model import Model
+from softwarp.solvers.linear.cholesky import PanelSolver
 from softwarp.solvers.response import ContactResponse
 from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.workspace.rows import Rows
@@ -68,10 +69,13 @@ class FurtherLooks:
         shard: Worlds; ``Options.further_passes`` and ``Options.skin`` are theirs.
         contact: Contacts.
         response: Their response.
+        panels: The linear solver's panels, where it has any.
     """
 
-    def __init__(self, shard: Shard, contact: ContactTerm, response: ContactResponse) -> None:
-        self.shard, self.contact, self.response = shard, contact, response
+    def __init__(
+        self, shard: Shard, contact: ContactTerm, response: ContactResponse, panels: PanelSolver | None
+    ) -> None:
+        self.shard, self.contact, self.response, self.panels = shard, contact, response, panels
         self.k = looks.kernels(shard.variant)
         self.arm = wp.array(dof_arms(shard.model), dtype=shard.variant.real, device=shard.device)
         self.any = memory.zeros((1,), wp.int32, shard.device)
@@ -104,7 +108,9 @@ class FurtherLooks:
 
         def act() -> None:
             self.mark()
+            self._skip(self.contact.contacts.idle)
             look()
+            self._skip(None)
             for values, before in self.kept:
                 inputs = [self.contact.contacts.idle.real, before.real]
                 self.shard.each_real(self.k.hold, values.real.shape[1], inputs, [values.real])
@@ -113,6 +119,13 @@ class FurtherLooks:
             act()
         else:
             wp.capture_if(self.any, act)
+
+    def _skip(self, idle: Rows | None) -> None:
+        """Leave idle worlds out of what takes long where each has threads of its own; None leaves out nobody."""
+        response, panels = self.response, self.panels
+        response.skipped = idle or response.everyone
+        if panels is not None:
+            panels.skipped = idle.S if idle is not None else panels.everyone
 
     def end(self) -> None:
         """All worlds count again."""

@@ -204,7 +204,7 @@ class ContactMultipliers(Multipliers):
         )
         self.response = self.laws
         if contact is not None and further:
-            self.further = FurtherLooks(s, contact, self.laws)
+            self.further = FurtherLooks(s, contact, self.laws, self.linear.panels)
 
     def add_forces(self, target: Rows, f_scale: float) -> None:
         """target += f_scale H' multiplier of all rows."""

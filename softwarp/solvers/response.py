@@ -99,6 +99,7 @@ class ContactResponse:
         gap: Free gaps [m]; (order). ``solve`` overwrites them.
         change: Change of the multipliers [N] in the last ``solve``; (order).
         compliance, floor, ceiling, residual: Those of ``laws``.
+        skipped: 1 in worlds that a GPU does not solve for; none, unless somebody puts other rows here; (1).
     """
 
     def __init__(
@@ -168,6 +169,8 @@ class ContactResponse:
         self.compliance, self.residual = laws.compliance, laws.residual
         self.floor, self.ceiling = laws.floor, laws.ceiling
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
+        self.everyone = rows.allocate(self.variant, world_count, 1, self.device, wp.int32)
+        self.skipped = self.everyone
 
     # Stages
 
@@ -266,7 +269,7 @@ class ContactResponse:
         if self.variant.world_fastest:
             outputs += [self.history.S, self.system.S, self.residual.S]
             limits += [extent, coulomb_warp_newton.stride_of(self.order)]
-            self._solve_by_warps(structure, [*limits, *inputs], outputs)
+            self._solve_by_warps(structure, [*limits, self.skipped.S, *inputs], outputs)
         else:
             outputs += [self.curve.S, self.history.S, self.gram.S, self.residual.S]
             self._each_world(self.k_law.gauss_seidel, [*structure, *limits, extent, *inputs], outputs)

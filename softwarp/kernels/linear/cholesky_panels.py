@@ -411,6 +411,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         threads: int,
         # Workspace in
         lower_in: wp.array2d(dtype=S),
+        skipped_in: wp.array2d(dtype=wp.int32),
         # Workspace out
         part_out: wp.array2d(dtype=S),
         half_out: wp.array2d(dtype=S),
@@ -418,6 +419,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """y <- L^-1 y for the first right-hand sides of one world; ``half`` has them by column in order of rounds."""
         w, thread = wp.tid()
+        if skipped_in[w, 0] != 0:
+            return
         parts = wp.min(threads, wp.static(PARTS))
         lane = thread % parts
         for turn in range(turn_count):
@@ -489,6 +492,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         is_added: bool,
         # Workspace in
         lower_in: wp.array2d(dtype=S),
+        skipped_in: wp.array2d(dtype=wp.int32),
         # Workspace out
         half_out: wp.array2d(dtype=S),
         y_out: wp.array2d(dtype=S),
@@ -496,6 +500,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """y <- L^-T y for the first right-hand side of one world, also added to u if asked for."""
         w, thread = wp.tid()
+        if skipped_in[w, 0] != 0:
+            return
         row_parts = wp.min(threads, wp.static(ROW_PARTS))
         parts = wp.min(threads, wp.static(PARTS))
         for back in range(turn_count):

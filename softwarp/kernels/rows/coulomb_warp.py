@@ -479,6 +479,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         extent: real,
         stride: int,
         # Workspace in
+        skipped_in: wp.array2d(dtype=wp.int32),
         pack_count_in: wp.array2d(dtype=wp.int32),
         delassus_in: wp.array2d(dtype=real),
         gap_in: wp.array2d(dtype=real),
@@ -499,11 +500,12 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
     ):
         """Accelerated sweeps over bounded static rows (``multiplier``) and contacts (``force``) of one world.
 
-        Worlds whose contacts are not more than ``above``, or more than ``most``, are left to other kernels.
+        Worlds whose contacts are not more than ``above``, or more than ``most``, are left to other kernels, and
+        ``skipped`` ones to none.
         """
         w, thread = wp.tid()
         count = pack_count_in[w, 0]
-        if count <= above or count > most:
+        if count <= above or count > most or skipped_in[w, 0] != 0:
             return
         if wp.static(near_rows > 0):
             bring_near(delassus_in, w, order, thread, rows + 3 * count)

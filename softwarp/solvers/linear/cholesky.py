@@ -292,6 +292,7 @@ class PanelSolver:
     Attributes:
         threads: Threads per block, but for the factorisation; a CPU has one.
         half: Half-solved right-hand sides, by column in order of rounds; (world, 3 n sides and more).
+        skipped: 1 in worlds without substitutions; none, unless somebody puts another array here; (world, 1).
     """
 
     def __init__(
@@ -325,6 +326,8 @@ class PanelSolver:
         self.part = scratch(3 * sides * plan.row_count)
         self.half = scratch(3 * sides * (n + plan.column_limit))  # half-solved sides, then those of one round
         self.scratch = 3 * sides * n
+        self.everyone = memory.zeros((world_count, 1), wp.int32, device)
+        self.skipped = self.everyone
 
     def factor(self, a: Rows) -> None:
         """Factorise the matrices whose stored blocks are ``a``."""
@@ -340,7 +343,7 @@ class PanelSolver:
         names = ("turn_column", "turn_row", "turn_lower", "column", "column_part", "row", "row_part", "part")
         structure = [i[name] for name in names]
         inputs = [plan.size, plan.row_count, plan.turn_count, *structure, sides, self.scratch, self.threads]
-        inputs.append(self.lower)
+        inputs += [self.lower, self.skipped]
         self.cooperate(self.kernels.forward_panels, inputs, [self.part, self.half, self.y.S])
 
     def backward(self, u: Rows | None = None) -> None:
@@ -349,7 +352,7 @@ class PanelSolver:
         structure = [i[name] for name in ("turn_column", "turn_lower", "column", "column_lower", "row_index")]
         inputs = [plan.turn_count, *structure, self.scratch, self.threads]
         outputs = [self.half, self.y.S, (u or self.y).S]
-        self.cooperate(self.kernels.backward_panels, [*inputs, u is not None, self.lower], outputs)
+        self.cooperate(self.kernels.backward_panels, [*inputs, u is not None, self.lower, self.skipped], outputs)
 
     def team(self, threads: int) -> int:
         """Threads that a block of so many has on this device."""

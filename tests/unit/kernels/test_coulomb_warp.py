@@ -59,6 +59,7 @@ def swept(
         own = -(-rows // 32), -(-count // 32), near
         kernel = coulomb_warp.kernels(lanes.variant("cuda", precision), *own).gauss_seidel
         structure = [bounded, rows, order, -1, count, *limits, coulomb_warp_newton.stride_of(order)]
+        structure.append(wp.zeros((1, 1), dtype=wp.int32, device=device))
         outputs = [multiplier, force, change, history, zeros(coulomb_warp_newton.entries(order)), residual]
         wp.launch(kernel, (1, 32), [*structure, *inputs], outputs, device=device, block_dim=32)
     gap = case.free + case.matrix @ change.numpy()[0].astype(float)

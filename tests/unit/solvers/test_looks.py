@@ -14,13 +14,12 @@ SPEED = 3.0  # m/s
 THROWN = (2, 5)  # worlds
 
 
-def scene(worlds: int, *, device: str = "cpu", passes: int | None = None) -> sw.Simulation:
+def scene(worlds: int, *, device: str = "cpu", passes: int | None = None, path: str = "lanes") -> sw.Simulation:
     """A tube beside a ball."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     tube = sw.Tube([sw.TubeSection(0.1)], radius=1e-3, youngs=1e9)
     line = builder.add_telescope([tube], segments=8, lengths=(0.08,), contact_radius=2e-4)
     builder.add_contact(line, builder.add_rigid(sw.Sphere(0.005), kinematic=True, pose=(0.008, 0.004, 0.06)))
-    path = "auto" if device != "cpu" else "lanes"
     model = builder.finalize(worlds, device)
     return sw.Simulation(model, dt=0.01, contact_passes=passes, solver_path=path, threads=1)
 
@@ -31,8 +30,11 @@ def throw(sim: sw.Simulation, worlds: tuple[int, ...]) -> None:
         sim.rod_v[world, 1:, 0] = SPEED
 
 
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
-def test_a_world_looks_again_by_its_own_need(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("device", "path"),
+    [("cpu", "lanes"), *(pytest.param("cuda:0", path, marks=pytest.mark.cuda) for path in ("panels", "levels"))],
+)
+def test_a_world_looks_again_by_its_own_need(device: str, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that are thrown do so in the midst of others at rest, and all have the bits that they have alone."""
     looked: list[torch.Tensor] = []
     watch = FurtherLooks.watch
@@ -42,7 +44,7 @@ def test_a_world_looks_again_by_its_own_need(device: str, monkeypatch: pytest.Mo
         looked.append(torch.as_tensor(1 - self.contact.contacts.idle.real.numpy().reshape(-1)))
 
     monkeypatch.setattr(looks, "SKIN", 1e-3)  # so that all that is thrown looks again
-    sims = [scene(9, device=device), *(scene(1, device=device) for _ in range(3))]
+    sims = [scene(worlds, device=device, path=path) for worlds in (9, 1, 1, 1)]
     monkeypatch.setattr(FurtherLooks, "watch", told)
     throw(sims[0], THROWN)
     for sim in sims[1::2]:
