@@ -36,6 +36,9 @@ Floats = NDArray[np.float64]
 Options = Mapping[str, Any]
 WARPED = {"rotation": "warped"}
 SOLID = WARPED | {"element": "p2"}
+DIAMOND_LOADS = ((0.0, 0.0, -5.0), (0.0, 0.0, 10.0), (5.0, 0.0, 0.0), (2.5, 2.5, -2.5))  # m/s^2
+# m, of the top under these: limits that ``fidelity_truth`` finds
+DIAMOND_WAYS = 1e-3 * np.array([[0.0, 0.0, -32.51], [0.0, 0.0, 27.70], [32.21, 0.0, -1.55], [16.92, 16.92, -13.14]])
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,8 @@ class Robot:
     Attributes:
         scene: Adds the robot's whole scene to a builder, from options.
         rest: Places of the point that is looked at, one for every load, and where it is without, from options.
-        truth: Options of the finest affordable quadratic mesh.
+        truth: Options of the finest affordable quadratic mesh, or ways of the point that were extrapolated from several
+            [m], (load, 3).
         variants: Options by name; the first is the default.
         gravity: Of the scene [m/s^2].
         drive: Commands of a step.
@@ -53,7 +57,7 @@ class Robot:
 
     scene: Callable[[Options, softwarp.ModelBuilder], Any]
     rest: Callable[[Options], tuple[Floats, Floats]]
-    truth: Options
+    truth: Options | Floats
     variants: Mapping[str, Options]
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     drive: Callable[[softwarp.Simulation, int], None] = field(default=lambda sim, step: None)
@@ -110,8 +114,7 @@ def _diamond(options: Options) -> tuple[Floats, Floats]:
     def held(x: Floats) -> NDArray[np.bool_]:
         return (np.abs(x[:, 0]) <= limit) & (np.abs(x[:, 1]) <= limit) & (x[:, 2] <= 0.01)
 
-    gravity = ((0.0, 0.0, -5.0), (0.0, 0.0, 10.0), (5.0, 0.0, 0.0), (2.5, 2.5, -2.5))
-    return weighed(diamond_mesh(config), config, config.total_mass, held, EFFECTOR, gravity)
+    return weighed(diamond_mesh(config), config, config.total_mass, held, EFFECTOR, DIAMOND_LOADS)
 
 
 def _tripod(options: Options) -> tuple[Floats, Floats]:
@@ -172,8 +175,12 @@ ROBOTS = {
     "Diamond": Robot(
         lambda options, builder: build_diamond_scene(DiamondSceneConfig(**options), builder),
         _diamond,
-        {"mesh": "medium", **SOLID},
-        {"default": {}, "fine": {"mesh": "fine", **WARPED, "lumping": "volume"}, "p2": {"mesh": "coarse", **SOLID}},
+        DIAMOND_WAYS,
+        {
+            "default": {},
+            "fine": {"mesh": "fine", **WARPED, "lumping": "volume"},
+            "p2": {"mesh": "coarse", **SOLID},
+        },
         (0.0, 0.0, 0.0),
         _pull,
     ),

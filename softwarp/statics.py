@@ -280,12 +280,14 @@ class Statics:
         has_exact = self._has_exact_tangent()
         if self._relaxations is None or (has_exact.any() and True not in self._relaxations):
             options = replace(self.options, newton_iterations=NEWTON_ITERATIONS, pressure_tangent=True)
-            exact = replace(options, project_tangent=False)
+            turns = any(law in TURNED for law in self._laws())
+            exact = replace(options, project_tangent=False, turning_tangent=turns)
 
             def make() -> dict[bool, list[Relaxation]]:
                 kinds = {False: options, True: exact} if has_exact.any() else {False: options}
                 return {
-                    key: [Relaxation(system.with_options(o)) for system in self._systems] for key, o in kinds.items()
+                    key: [Relaxation(system.with_options(o, exact=o.turning_tangent)) for system in self._systems]
+                    for key, o in kinds.items()
                 }
 
             self._relaxations = with_room(make, "solve_static", self.model, interop.empty_cache)
@@ -334,11 +336,14 @@ class Statics:
     def _has_exact_tangent(self) -> np.ndarray[Any, Any]:
         """Worlds whose steps can take an exact tangent that differs from the usual one, shape (world,).
 
-        Rods have one, and hyperelastic bodies. What cables compress would be held by the stiffness of their tension,
-        which A lacks here: they must lie on other parts. Moments whose axes stand in space have no symmetric tangent.
+        Rods have one, and soft bodies. What cables compress would be held by the stiffness of their tension, which A
+        lacks here: they must lie on other parts. Moments whose axes stand in space have no symmetric tangent. Where
+        ``_leave_saddles`` looks, elements that turn need not be looked at here.
         """
         m = self.model
-        has_solids = any(law not in TURNED for law in self._laws()) and m.membranes is None and m.reduction is None
+        looks_later = self._systems[0].has_exact_tangent
+        has_solids = any(law not in TURNED or not looks_later for law in self._laws())
+        has_solids = has_solids and m.membranes is None and m.reduction is None
         is_pulled = m.cable_count > 0 and (m.segment_count == 0 or m.point_node.numpy().max() >= m.own_node_count)
         if is_pulled or not (m.segment_count or has_solids):
             return np.zeros(self.model.num_worlds, dtype=bool)

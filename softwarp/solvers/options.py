@@ -37,6 +37,8 @@ class Options:
         bounce_speed: Approach [m/s] up to which a contact with restitution does not bounce.
         project_tangent: Clamp element tangents of hyperelastic laws to positive semidefinite ones.
         pressure_tangent: Add the tangent of chamber pressures to A.
+        turning_tangent: Add to A how the rotations of ``large`` and ``warped`` elements follow positions, by its
+            symmetric part; for exact workspaces.
         reach: Distance in extents of the scene that a node may move in one step before its world counts as diverged.
         gpu_path: How a GPU factors A: ``panels``, ``levels``, or ``auto`` by the number of worlds.
     """
@@ -57,6 +59,7 @@ class Options:
     bounce_speed: Annotated[float, Range(low=0.0, high=1e6)] = 0.01
     project_tangent: bool = True
     pressure_tangent: bool = False
+    turning_tangent: bool = False
     reach: Annotated[float, Range(above=0.0, high=1e6)] = 1.0
     gpu_path: str = "auto"
 

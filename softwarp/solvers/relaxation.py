@@ -162,7 +162,7 @@ class Course:
         self.reason = np.full(worlds, GOING_ON)
         self.longest = np.where(settled > 0.0, settled, longest)
         self.push, self._pushes = np.zeros(worlds), np.zeros(worlds, dtype=int)
-        self._kept = np.full((worlds, 3), np.inf)  # ways of the last steps
+        self._kept = np.full((worlds, 6), np.inf)  # ways of the last steps
         self._saddles, self._idle = np.zeros(worlds, dtype=int), np.zeros(worlds, dtype=int)
         self._last, self.gone = np.full(worlds, np.inf), np.zeros(worlds)
         self._longest, self._best, self._most = np.zeros(worlds), np.full(worlds, np.inf), np.zeros(worlds)
@@ -270,7 +270,7 @@ class Course:
         if self._strayed[world] > STRAYED:
             self._doubted[world] = GOING_ON
         elif self._doubts[world] >= DOUBTS and self.reason[world] in (GOING_ON, StaticReason.NO_EQUILIBRIUM):
-            if not self._leaves(world):
+            if not (self._leaves(world) or self._grows(world)):
                 self.reason[world] = self._doubted[world]
 
     def _try_other(self, world: int, is_settled: bool, indefinite: bool) -> bool:
@@ -300,7 +300,11 @@ class Course:
 
     def _leaves(self, world: int) -> bool:
         """Whether ways grow from step to step."""
-        return bool(self._kept[world, 2] > LEAVING * self._kept[world, 0])
+        return bool(self._kept[world, -1] > LEAVING * self._kept[world, -3])
+
+    def _grows(self, world: int) -> bool:
+        """Whether ways grow slowly: the last two beside the two four steps before, for short steps take turns."""
+        return bool(self._kept[world, -2:].max() > LEAVING * self._kept[world, :2].max())
 
     def _push(self, world: int) -> None:
         """Give a world velocities in its next step."""

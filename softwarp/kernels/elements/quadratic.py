@@ -286,6 +286,7 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def block_turning(
+        scale: real,
         # Model
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array(dtype=wp.int32),
@@ -295,7 +296,7 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
         a_out: wp.array2d(dtype=S),
         a_upper_out: wp.array2d(dtype=S),
     ):
-        """Add B_a O_b around one 3x3 block (i, j), and the transpose of that of (j, i).
+        """Add B_a O_b around one 3x3 block (i, j), and the transpose of that of (j, i), scaled; see ``turning``.
 
         An entry is 256 element + 16 a + b.
         """
@@ -313,8 +314,8 @@ def turning_kernels(variant: Variant) -> SimpleNamespace:
                         b = point + 9 * (entry[p] & 15)
                         below += entry_product(node_turning_in, w, a + 3 * r, b + 90 + c)
                         above += entry_product(node_turning_in, w, b + 3 * c, a + 90 + r)
-                a_out[w, 9 * block + 3 * r + c] += below
-                a_upper_out[w, 9 * block + 3 * r + c] += above
+                a_out[w, 9 * block + 3 * r + c] += mul(S(scale), below)
+                a_upper_out[w, 9 * block + 3 * r + c] += mul(S(scale), above)
 
     return SimpleNamespace(spread_turning=spread_turning, block_turning=block_turning)
 

@@ -168,6 +168,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def block_turning(
+        scale: real,
         # Model
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array(dtype=wp.int32),
@@ -177,7 +178,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         a_out: wp.array2d(dtype=S),
         a_upper_out: wp.array2d(dtype=S),
     ):
-        """Add B_a O_b of all tets around one 3x3 block (i, j), and the transpose of that of block (j, i)."""
+        """Add B_a O_b of all tets around one 3x3 block (i, j), and the transpose of that of block (j, i), scaled.
+
+        Both may go to the same A, which then has twice the symmetric part.
+        """
         w, block = wp.tid()
         if wp.static(world_fastest):
             block, w = wp.tid()
@@ -190,7 +194,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     b = entry[p] & 3
                     below += product(tet_turning_in, w, entry[p] >> 4, a, b, r, c)
                     above += product(tet_turning_in, w, entry[p] >> 4, b, a, c, r)
-                a_out[w, 9 * block + 3 * r + c] += below
-                a_upper_out[w, 9 * block + 3 * r + c] += above
+                a_out[w, 9 * block + 3 * r + c] += mul(S(scale), below)
+                a_upper_out[w, 9 * block + 3 * r + c] += mul(S(scale), above)
 
     return SimpleNamespace(tet_turning=tet_turning, warped_turning=warped_turning, block_turning=block_turning)

@@ -178,14 +178,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Whether the last solve failed, as it does on an indefinite A; then A gets less of the pressures' tangent.
 
-        What it gets grows again from solve to solve.
+        What it gets grows again from solve to solve. A world that goes back to its best iterate has not left it either.
         """
         pack, lane = wp.tid()
         failed = real(0.0)
         for row in range(count):
             if not wp.isfinite(u_in[pack, row, lane]):
                 failed = real(1.0)
-        if control_out[pack, wp.static(ACCEPTED), lane] < real(0.5):
+        is_back = control_out[pack, wp.static(RETURNING), lane] > real(0.5)
+        if control_out[pack, wp.static(ACCEPTED), lane] < real(0.5) and not is_back:
             failed = real(0.0)
         control_out[pack, wp.static(FAILED), lane] = failed
         change = wp.where(failed > real(0.5), real(wp.static(REDUCTION)), real(wp.static(RECOVERY)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from softwarp.kernels.elements import quadratic, stored
 from softwarp.model.quadratic import QuadraticModel
-from softwarp.solvers.terms.term import Term
+from softwarp.solvers.terms.term import Term, load_factor
 from softwarp.solvers.terms.tets import LinearTets, TetArrays
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -64,14 +64,22 @@ class QuadraticTerm(Term):
             inputs += [w.body_stiffness.S, w.gauss_stiffness.S]
             s.each(self.k_stored.weighted_stiffness, s.blocks, inputs, [w.a.S])
 
+    def load_tangent(self, h: float) -> None:
+        """The symmetric part of what ``turn`` adds, if asked for; elements whose corners frames carry go without."""
+        if self.shard.options.turning_tangent:
+            self._add_turning(0.5 * load_factor(h), self.shard.work.a)
+
     def turn(self, a_upper: Rows) -> None:
         """What the rotations of turned laws depend on positions."""
+        self._add_turning(1.0, a_upper)
+
+    def _add_turning(self, scale: float, a_upper: Rows) -> None:
         if not self.points.turned:
             return
         s, m, w = self.shard, self.model, self.shard.work
         self.points.turn()
         s.each(self.k_turning.spread_turning, quadratic.POINTS * m.count, [w.gauss_turning.S], [w.gauss_node_turning.S])
-        inputs = [m.large_entry_start, m.large_entry, w.gauss_node_turning.S]
+        inputs = [scale, m.large_entry_start, m.large_entry, w.gauss_node_turning.S]
         s.each(self.k_turning.block_turning, s.blocks, inputs, [w.a.S, a_upper.S])
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:

@@ -12,7 +12,7 @@ import warp as wp
 
 from softwarp.kernels.elements import access, corotational, hyperelastic, spectral, stored, turning, warped
 from softwarp.model.codes import TURNED
-from softwarp.solvers.terms.term import Term
+from softwarp.solvers.terms.term import Term, load_factor
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
@@ -146,11 +146,19 @@ class TetTerm(Term):
             inputs = [m.tet_body, m.stored_entry_start, m.stored_entry, w.body_stiffness.S, w.tet_stiffness.S]
             s.each(stored.kernels(s.variant).block_stiffness, s.blocks, inputs, [w.a.S])
 
+    def load_tangent(self, h: float) -> None:
+        """The symmetric part of what ``turn`` adds, if asked for; elements whose corners frames carry go without."""
+        if self.shard.options.turning_tangent:
+            self._add_turning(0.5 * load_factor(h), self.shard.work.a)
+
     def turn(self, a_upper: Rows) -> None:
         """What the rotations of turned laws depend on positions."""
+        self._add_turning(1.0, a_upper)
+
+    def _add_turning(self, scale: float, a_upper: Rows) -> None:
         if not self.tets.turned:
             return
         s, m, w = self.shard, self.shard.model, self.shard.work
         self.tets.turn()
-        inputs = [m.large_entry_start, m.large_entry, w.tet_turning.S]
+        inputs = [scale, m.large_entry_start, m.large_entry, w.tet_turning.S]
         s.each(turning.kernels(s.variant).block_turning, s.blocks, inputs, [w.a.S, a_upper.S])

@@ -39,3 +39,13 @@ def test_solids_are_held_and_bent(name):
     places, start = robots.ROBOTS[name].rest(robots.ROBOTS[name].variants["default"])
     ways = np.linalg.norm(places - start, axis=1)
     assert (ways > 1e-3).all() and (ways < 0.3).all()
+
+
+@pytest.mark.slow  # 10 s; the coarsest of the meshes whose limit is taken for truth
+def test_parts_of_the_diamond_rest_where_the_whole_one_does():
+    """Halves and quarters under loads as symmetric as they are."""
+    truth, robots = (cli.script("benchmarks", name) for name in ("fidelity_truth", "fidelity_robots"))
+    places, start = robots.ROBOTS["Diamond"].rest(robots.ROBOTS["Diamond"].variants["p2"])
+    axial, side = truth.ways(1, truth.AXIAL, 4), truth.ways(1, truth.SIDE, 2)
+    found = np.concatenate([axial, side, truth.ways(1, truth.OBLIQUE, 2, np.pi / 4.0) @ truth.turned(np.pi / 4.0)])
+    np.testing.assert_allclose(found, places - start, atol=1e-8)
