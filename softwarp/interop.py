@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -134,42 +133,6 @@ def replaying(device: str) -> AbstractContextManager[Any]:
     return on_torch_stream(device) if wp.get_device(device).is_cuda else nullcontext()
 
 
-def side_by_side(device: str, jobs: Sequence[Callable[[], None]]) -> None:
-    """Do every job, several on a CUDA device on streams of their own, which the current stream then waits for.
-
-    Args:
-        device: Warp device.
-        jobs: Launches by Warp and by torch, after all that is on the current stream; torch may be capturing that.
-    """
-    if len(jobs) < 2 or not wp.get_device(device).is_cuda:
-        for job in jobs:
-            job()
-        return
-    import torch
-
-    chosen = wp.device_to_torch(wp.get_device(device))
-    current = torch.cuda.current_stream(chosen)
-    begun = current.record_event()
-    streams = _streams(device, len(jobs), current.cuda_stream)
-    for job, stream in zip(jobs, streams, strict=True):
-        stream.wait_event(begun)
-        with torch.cuda.stream(stream), wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
-            job()
-    for stream in streams:
-        current.wait_stream(stream)
-
-
-@cache
-def _streams(device: str, count: int, _current: int) -> list[torch.cuda.Stream]:
-    """Streams beside a current one that wait for no other; Warp's own would wait for the default one.
-
-    What torch captures takes its side streams with it, so that those beside another stream must be others.
-    """
-    import torch
-
-    return [torch.cuda.Stream(wp.device_to_torch(wp.get_device(device))) for _ in range(count)]
-
-
 @contextmanager
 def uncollected() -> Iterator[None]:
     """Collect garbage now and none meanwhile: an earlier graph that is freed during a capture makes that fail."""
@@ -207,13 +170,6 @@ def capturing(device: str) -> Iterator[wp.ScopedCapture]:
         tidy = uncollected()
     with alone, tidy, scope, wp.ScopedCapture(device=device) as capture:
         yield capture
-
-
-def recorded(device: str, launch: Callable[[], None]) -> Any:
-    """The graph of what a function launches."""
-    with capturing(device) as capture:
-        launch()
-    return capture.graph
 
 
 def refuse_assignment(owner: str, name: str, value: Any, *groups: dict[str, torch.Tensor] | None) -> None:

@@ -21,7 +21,7 @@ from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.looks import chosen_looks
 from softwarp.solvers.options import Integrator, Options
 from softwarp.solvers.outputs import update_outputs
-from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, turn_count, world_ranges
+from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import Relaxation
 from softwarp.solvers.second_order import stepper
@@ -167,11 +167,11 @@ class Simulation(
         self.params = interop.Views("sim.params", interop.views(self._parameters, model))
         self._index = upload(model.symbolic, model.device)
         self._bounds = world_ranges(self.variant, model, threads)
-        self._turns = turn_count(self.variant, threads, len(self._bounds))  # shards side by side; others wait
+        self._turns = min(thread_count(threads), len(self._bounds))  # shards side by side; others wait for theirs
         self._shares_workspaces = True
         self._systems = self._make_shards(model, self._state)
         self._contact_growth = checks.flag(contact_growth, "Simulation: contact_growth") and model.contact is not None
-        self._workers = Workers(self._turns) if self._turns > 1 and not self.variant.world_fastest else None
+        self._workers = Workers(self._turns) if self._turns > 1 else None
         self._exact: tuple[Model, dict[str, wp.array]] | None = None
         self._statics: list[QuasiStatic] | None = None
         self._relaxations: dict[bool, list[Relaxation]] | None = None
@@ -330,10 +330,9 @@ class Simulation(
             self._capture()
         if self._graphs is None or is_captured:  # the first step compiles kernels, which a capture cannot
             with interop.on_torch_stream(self.device):
-                for stepper in self._steppers:
+                for shard, stepper in enumerate(self._steppers):
                     stepper.always = is_captured  # a recording of Torch cannot branch
-                self._side_by_side([stepper.step for stepper in self._steppers], count)
-                for stepper in self._steppers:
+                    self._repeat(shard, stepper.step, count)
                     stepper.always = False
                 self._update_outputs()
             self._is_compiled = True
@@ -358,15 +357,14 @@ class Simulation(
 
     def _replay(self, graphs: Sequence[Any], count: int) -> None:
         """Replay the graphs of the shards, on a CPU side by side and then that of the outputs, which is the last."""
-        launches = [partial(wp.capture_launch, graph) for graph in graphs[: len(self._systems)]]
 
         def run(turn: int) -> None:
-            for shard in range(turn, len(launches), self._turns):
-                self._repeat(shard, launches[shard], count)
+            for shard in range(turn, len(self._systems), self._turns):
+                self._repeat(shard, partial(wp.capture_launch, graphs[shard]), count)
 
         try:
             if self._workers is None:
-                self._side_by_side(launches, count)
+                run(0)
             else:
                 self._workers.run(run, range(self._turns), helping=count == 1)  # a single launch, which nothing cuts
         finally:  # also on an interrupt
@@ -374,9 +372,6 @@ class Simulation(
                 wp.capture_launch(graphs[-1])
             else:
                 self._update_outputs()
-
-    def _side_by_side(self, advances: Sequence[Callable[[], None]], count: int) -> None:
-        interop.side_by_side(self.device, [partial(self._repeat, *each, count) for each in enumerate(advances)])
 
     def _repeat(self, shard: int, advance: Callable[[], None], count: int) -> None:
         """Take the worlds of a shard through ``count`` steps and keep the worst status."""
@@ -450,7 +445,12 @@ class Simulation(
         records = [stepper.step for stepper in self._steppers]
         if not self.variant.world_fastest:  # on a CPU a replay needs no turn with Warp, a launch does
             records.append(self._update_outputs)
-        self._graphs = [interop.recorded(self.device, record) for record in records]
+        graphs = []
+        for record in records:
+            with interop.capturing(self.device) as capture:
+                record()
+            graphs.append(capture.graph)
+        self._graphs = graphs
 
     def _update_outputs(self) -> None:
         update_outputs(self.model, self._state, world_fastest=self.variant.world_fastest)

@@ -17,9 +17,6 @@ from softwarp.solvers.options import SolverPath as SolverPath
 GPU_PATHS = ("panels", "levels")
 MOST_THREADS = 4096
 LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
-GPU_SHARDS = 2  # of reduced bodies side by side on a GPU: while one waits for its slowest world, the other works
-GPU_WORLDS = 1024  # of such a shard, at least; benchmarks/reduced.py. Other scenes have not been measured
-GPU_UNIT = 32  # worlds of a warp, which no shard shares with another
 SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes through a step together: its cache
 
 
@@ -52,27 +49,20 @@ def thread_count(threads: int | None) -> int:
     return available if threads is None else checks.count(threads, "threads", high=MOST_THREADS)
 
 
-def turn_count(chosen: Variant, threads: int | None, shards: int) -> int:
-    """Shards that step at the same time: one for each thread of a CPU, all on a GPU."""
-    return shards if chosen.world_fastest else min(thread_count(threads), shards)
-
-
 def world_ranges(chosen: Variant, model: Model, threads: int | None) -> list[tuple[int, int]]:
-    """Worlds that step as one: on a CPU as many as a core's cache holds, those with most worlds first.
+    """Worlds that step as one: all on a GPU; on a CPU as many as a core's cache holds, those with most worlds first.
 
-    Each thread has as many of these shards as the others, if there are enough worlds. On a GPU many worlds of reduced
-    bodies make two shards, which step at the same time; all others are one.
+    Each thread has as many of these shards as the others, if there are enough worlds.
     """
     worlds = model.num_worlds
-    unit = GPU_UNIT if chosen.world_fastest else LANE_COUNT if chosen.lanes > 1 else 1
-    packs = -(-worlds // unit)
     if chosen.world_fastest:
-        count = 1 if model.reduction is None else min(max(worlds // GPU_WORLDS, 1), GPU_SHARDS)
-    else:
-        count = thread_count(threads)
-        factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * unit
-        together = max(1, int(SHARD_BYTES / max(factors, 1.0)))
-        count *= -(-packs // (count * together))
+        return [(0, worlds)]
+    count = thread_count(threads)
+    unit = LANE_COUNT if chosen.lanes > 1 else 1
+    packs = -(-worlds // unit)
+    factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * unit
+    together = max(1, int(SHARD_BYTES / max(factors, 1.0)))
+    count *= -(-packs // (count * together))
     sizes = [part.size for part in np.array_split(np.arange(packs), min(count, packs))]
     cuts = np.cumsum([0, *sizes]) * unit
     return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts)]

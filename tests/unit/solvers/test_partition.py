@@ -1,14 +1,11 @@
 """Which kernels a batch is taken through a step with, and what of it reaches the bits of a result."""
 
-import dataclasses
-
 import pytest
 import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.kernels.algebra.lanes import variant
-from softwarp.solvers.partition import GPU_UNIT, GPU_WORLDS, LANES_FROM, choose_variant, turn_count, world_ranges
+from softwarp.solvers.partition import LANES_FROM, choose_variant
 
 
 def scene(worlds: int, precision: str = "float32") -> sw.Model:
@@ -36,20 +33,6 @@ def test_path_that_auto_takes_is_the_documented_one():
         assert choose_variant(scene(worlds, "float64"), "auto").name == "scalar"
         for path in ("scalar", "lanes"):
             assert choose_variant(scene(worlds), path).name == path
-
-
-def test_many_worlds_of_a_gpu_are_two_shards():
-    """Of reduced bodies, from twice ``GPU_WORLDS`` on: whole warps, all worlds once, and both at the same time."""
-    chosen, one = variant("cuda", "float32"), scene(1)
-    assert world_ranges(chosen, dataclasses.replace(one, num_worlds=4096), None) == [(0, 4096)]
-    one = dataclasses.replace(one, reduction=object())
-    for worlds in (1, 33, 2 * GPU_WORLDS - 1, 2 * GPU_WORLDS, 4096, 5001):
-        bounds = world_ranges(chosen, dataclasses.replace(one, num_worlds=worlds), None)
-        assert len(bounds) == (1 if worlds < 2 * GPU_WORLDS else 2) == turn_count(chosen, 1, len(bounds))
-        assert [world for part in bounds for world in range(*part)] == list(range(worlds))
-        assert all(begin % GPU_UNIT == 0 for begin, _ in bounds)
-        sizes = [end - begin for begin, end in bounds]
-        assert max(sizes) - min(sizes) <= 2 * GPU_UNIT
 
 
 def test_one_path_gives_one_answer():
