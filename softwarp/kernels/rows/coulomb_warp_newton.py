@@ -10,181 +10,89 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear.cholesky_panels import name_of, named
+from softwarp.kernels.linear.cholesky_panels import name_of
 from softwarp.kernels.rows import warp_share
 from softwarp.kernels.rows.coulomb_newton import DAMPING, EVENTS, GROWN, HEAVY, LONGEST, ON_CONE, PIVOT
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
 from softwarp.kernels.rows.warp_share import first_thread, meet, places, told_number
 
 MOST = 95  # rows of a system up to which it is solved: all worlds wait for the one that takes longest
-BLOCK = 8  # unknowns that are eliminated together: a read of an entry serves all of them
-LINES = 4  # of the system that a thread changes at a time, so that loads need not wait for each other
 TRIES = 10  # ways that are gone before a world goes on with the acceleration
 
 NONE, FIXED, LOW, HIGH, FREE, OPEN, BARE, STICK, SLIDE = range(9)  # no law that holds; those of rows, then of contacts
 GOES, RESTS, LOST, LARGE = range(4)  # what came of it: a way, nothing to solve, no solution, too many rows
 ENDLESS = 1.0e30
 
-# A line of the system: one entry per unknown, the right side, and behind it 1 / pivot. Eight unknowns at a time: every
-# thread eliminates among them for itself, brings its columns of their lines up to date, then the factors of lines of
-# its own, and last all that is left of its columns. Each entry is changed by one unknown after the other, as it would
-# be without blocks. The solution ends in the column of the right side. A function apart leaves registers to sweeps.
+# A line of the system: one entry per unknown, the right side, and behind the last one 1 / pivot. Four lines at a time,
+# so that loads need not wait for each other. Threads own columns; the solution ends in the column of the right side.
 _SOLVE = """
 #if defined(__CUDA_ARCH__)
-#define APART __noinline__
 #define MEET __syncwarp();
 #define TELL(value, source) __shfl_sync(0xffffffffu, value, source)
 #else
-#define APART
-#define MEET WP_TILE_SYNC();
 static SCALAR slot;
+#define MEET WP_TILE_SYNC();
 #define TELL(value, source) ({ if (thread == source) slot = value; MEET const SCALAR told = slot; MEET told; })
 #endif
-struct alignas(16) part_t { SCALAR v[16 / sizeof(SCALAR)]; };
-struct line_t { part_t parts[BLOCK * sizeof(SCALAR) / 16]; };
-#define PART(line, i) line.parts[(i) * sizeof(SCALAR) / 16].v[(i) % (16 / sizeof(SCALAR))]
-struct elimination {
-APART static CUDA_CALLABLE SCALAR run(SCALAR* const a, const int thread, const int unknowns, const int stride) {
 const int COLUMNS = MOST / 32 + 1;
+SCALAR* const a = &wp::index(system, w, 0);
 const int parts = unknowns / 32 + 1;
-for (int first = 0; first < unknowns; first += BLOCK) {
-    const int size = unknowns - first < BLOCK ? unknowns - first : BLOCK, behind = first + BLOCK;
-    line_t among[BLOCK];
-    SCALAR own[BLOCK][COLUMNS], inverse[BLOCK];
-    #pragma unroll
-    for (int i = 0; i < BLOCK; ++i) {
-        if (i >= size) continue;
-        const SCALAR* const line = a + (first + i) * stride;
-        among[i] = *(const line_t*)(line + first);
-        inverse[i] = line[unknowns + 1];
-        #pragma unroll
-        for (int m = 0; m < COLUMNS; ++m) {
-            const int c = thread + 32 * m;
-            own[i][m] = c >= first && c <= unknowns ? line[c] : (SCALAR)0;
-        }
+SCALAR top[COLUMNS];
+for (int k = 0; k < unknowns; ++k) {
+    SCALAR* const pivots = a + k * stride;
+    const SCALAR pivot = pivots[k], least = pivots[unknowns + 1];
+    const SCALAR inverse = (pivot < 0 ? -pivot : pivot) > least ? (SCALAR)1 / pivot : (SCALAR)0;
+    for (int m = 0; m < COLUMNS; ++m) {
+        const int c = thread + 32 * m;
+        top[m] = m < parts && c > k && c <= unknowns ? pivots[c] * inverse : (SCALAR)0;
     }
-    MEET
-    #pragma unroll
-    for (int k = 0; k < BLOCK; ++k) {
-        if (k >= size) continue;
-        const SCALAR pivot = PART(among[k], k), least = inverse[k];
-        inverse[k] = (pivot < 0 ? -pivot : pivot) > least ? (SCALAR)1 / pivot : (SCALAR)0;
-        SCALAR top[COLUMNS];
-        #pragma unroll
-        for (int m = 0; m < COLUMNS; ++m) top[m] = thread + 32 * m > first + k ? own[k][m] * inverse[k] : (SCALAR)0;
-        #pragma unroll
-        for (int j = k + 1; j < BLOCK; ++j) PART(among[k], j) *= inverse[k];
-        #pragma unroll
-        for (int i = k + 1; i < BLOCK; ++i) {
-            if (i >= size) continue;
-            const SCALAR factor = PART(among[i], k);
-            #pragma unroll
-            for (int j = k + 1; j < BLOCK; ++j) PART(among[i], j) -= factor * PART(among[k], j);
-            #pragma unroll
-            for (int m = 0; m < COLUMNS; ++m) own[i][m] -= factor * top[m];
-        }
-    }
-    #pragma unroll
-    for (int i = 0; i < BLOCK; ++i) {
-        if (i >= size) continue;
-        SCALAR* const line = a + (first + i) * stride;
-        #pragma unroll
-        for (int m = 0; m < COLUMNS; ++m) {
-            const int c = thread + 32 * m;
-            if (c >= first && c <= unknowns) line[c] = own[i][m];
-            own[i][m] *= inverse[i];
-        }
-        if (thread == 0) line[unknowns + 1] = inverse[i];
-    }
-    if (behind >= unknowns) continue;
-    for (int r = behind + thread; r < unknowns; r += 32) {
-        line_t* const line = (line_t*)(a + r * stride + first);
-        line_t factor = *line;
-        #pragma unroll
-        for (int k = 0; k < BLOCK; ++k)
-            #pragma unroll
-            for (int j = k + 1; j < BLOCK; ++j) PART(factor, j) -= PART(factor, k) * PART(among[k], j);
-        *line = factor;
-    }
-    MEET
-    for (int r = behind; r < unknowns; r += LINES) {
+    for (int r = k + 1; r < unknowns; r += 4) {
         SCALAR* const line = a + r * stride;
-        const int last = unknowns - r < LINES ? unknowns - r : LINES;
-        line_t factor[LINES];
-        #pragma unroll
-        for (int i = 0; i < LINES; ++i) if (i < last) factor[i] = *(const line_t*)(line + i * stride + first);
-        #pragma unroll
+        const int last = unknowns - r < 4 ? unknowns - r : 4;
+        SCALAR factor[4];
+        for (int i = 0; i < 4; ++i) factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
         for (int m = 0; m < COLUMNS; ++m) {
             const int c = thread + 32 * m;
-            if (m >= parts || c < behind || c > unknowns) continue;
-            SCALAR entry[LINES];
-            #pragma unroll
-            for (int i = 0; i < LINES; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
-            #pragma unroll
-            for (int i = 0; i < LINES; ++i)
-                #pragma unroll
-                for (int k = 0; k < BLOCK; ++k) if (i < last) entry[i] -= PART(factor[i], k) * own[k][m];
-            #pragma unroll
-            for (int i = 0; i < LINES; ++i) if (i < last) line[i * stride + c] = entry[i];
+            if (m >= parts || c <= k || c > unknowns) continue;
+            SCALAR entry[4];
+            for (int i = 0; i < 4; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
+            for (int i = 0; i < 4; ++i) if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m];
         }
     }
     MEET
+    if (thread == 0) pivots[unknowns + 1] = inverse;
 }
 MEET
 SCALAR x[COLUMNS], total = 0;
-#pragma unroll
 for (int m = 0; m < COLUMNS; ++m) {
     const int u = thread + 32 * m;
     x[m] = u < unknowns ? a[u * stride + unknowns] : (SCALAR)0;
 }
-for (int first = (unknowns - 1) / BLOCK * BLOCK; first >= 0; first -= BLOCK) {
-    line_t line[COLUMNS];
-    SCALAR inverse[BLOCK];
-    #pragma unroll
+for (int k = unknowns - 1; k >= 0; --k) {
+    SCALAR own = 0;
+    for (int m = 0; m < COLUMNS; ++m) own = m == k / 32 ? x[m] : own;
+    const SCALAR solved = TELL(own, k % 32) * a[k * stride + unknowns + 1];
+    total += solved;
     for (int m = 0; m < COLUMNS; ++m) {
         const int u = thread + 32 * m;
-        if (u < unknowns && u < first + BLOCK) line[m] = *(const line_t*)(a + u * stride + first);
-    }
-    #pragma unroll
-    for (int i = 0; i < BLOCK; ++i)
-        inverse[i] = first + i < unknowns ? a[(first + i) * stride + unknowns + 1] : (SCALAR)0;
-    #pragma unroll
-    for (int i = BLOCK - 1; i >= 0; --i) {
-        const int k = first + i;
-        if (k >= unknowns) continue;
-        SCALAR own = 0;
-        #pragma unroll
-        for (int m = 0; m < COLUMNS; ++m) own = m == k / 32 ? x[m] : own;
-        const SCALAR solved = TELL(own, k % 32) * inverse[i];
-        total += solved;
-        #pragma unroll
-        for (int m = 0; m < COLUMNS; ++m) {
-            const int u = thread + 32 * m;
-            if (u < k) x[m] -= PART(line[m], i) * solved;
-            else if (u == k) x[m] = solved;
-        }
+        if (u < k) x[m] -= a[u * stride + k] * solved;
+        else if (u == k) x[m] = solved;
     }
 }
-#pragma unroll
 for (int m = 0; m < COLUMNS; ++m) {
     const int u = thread + 32 * m;
     if (u < unknowns) a[u * stride + unknowns] = x[m];
 }
 MEET
-return total;
-}
-};
-return elimination::run(&wp::index(system, w, 0), thread, unknowns, stride);
-#undef APART
 #undef MEET
 #undef TELL
-#undef PART
+return total;
 """
 
 
 def stride_of(rows: int) -> int:
-    """Entries of a line of the system of a world with so many rows: unknowns, right side, reciprocal pivot; blocks."""
-    return -(-(min(rows, MOST) + 2) // BLOCK) * BLOCK
+    """Entries of a line of the system of a world with so many rows: unknowns, right side, reciprocal pivot."""
+    return min(rows, MOST) + 2
 
 
 def entries(rows: int) -> int:
@@ -205,9 +113,7 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
     first_contact = max(own_rows, 1)
     Numbers = Laws
 
-    sizes = {"SCALAR": name_of(real), "MOST": str(MOST), "BLOCK": str(BLOCK), "LINES": str(LINES)}
-
-    @wp.func_native(named(_SOLVE, sizes))
+    @wp.func_native(_SOLVE.replace("SCALAR", name_of(real)).replace("MOST", str(MOST)))
     def solve(system: wp.array2d(dtype=real), w: int, thread: int, unknowns: int, stride: int) -> real:
         """Solve the system; the sum of the solution, which is endless where one of its numbers is."""
 
@@ -378,7 +284,7 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
         verdict = int(GOES)
         if size == 0:
             verdict = int(RESTS)
-        if size > wp.static(MOST):
+        if size > stride - 2:
             verdict = int(LARGE)
         start = value
         if verdict == wp.static(GOES):
