@@ -18,12 +18,12 @@ def test_it_has_arrived_where_it_stays():
 
 @pytest.mark.slow
 def test_the_wave_turns_both_ways(tmp_path):
-    """One cycle of the hand-written wave turns the reduced robot by 1.3 degrees, to the left and to the right."""
+    """One cycle of the hand-written wave turns the reduced robot by 1.2 degrees, to the left and to the right."""
     file = tmp_path / "headings.json"
     arguments = ["--models", "reduced", "--actions", "8", "--headings", "2", "--json", str(file)]
     (shown,) = heading_study.main(arguments)
     assert shown.policy == heading_study.HAND and shown.failed == [False, False]
     for left, sign in zip(shown.left, (-1.0, 1.0), strict=True):
         assert left[0] == pytest.approx(sign * heading_study.LARGEST, abs=0.01)
-        assert sign * (left[4] - left[8]) == pytest.approx(1.33, abs=0.1)
+        assert sign * (left[4] - left[8]) == pytest.approx(1.21, abs=0.1)
     assert json.loads(file.read_text())[0]["left"] == shown.left
