@@ -298,6 +298,7 @@ class Statics:
         course = Course(settled, precision, limit, len(first.rounds), first.longest, has_exact)
         course.reason[~wanted] = StaticReason.CONVERGED  # as good as there
         start = {name: view.clone() for name, view in self._views.items() if view.numel()}
+        arrived = {name: view.clone() for name, view in start.items()} if has_exact.any() else {}
         iterations, late = 0, False
         with interop.on_torch_stream(self.model.device), self._standing():
             while iterations < max_iterations and not late and (course.reason == GOING_ON).any():
@@ -305,6 +306,7 @@ class Statics:
                     stepper = self._relaxations[is_exact]
                     late = late or self._advance_group(course, stepper, h, level, group, start, watch)
                 iterations += 1
+                self._remember(arrived, course.has_arrived())
                 over = course.reason != GOING_ON
                 watch.note(iterations, max_iterations, int(over.sum()), float(course.way[wanted].max()))
             gone = course.gone > AWAY
@@ -315,6 +317,8 @@ class Statics:
             }
             if gone.any():
                 self._put_back(start, ~gone)
+            if course.called_back.any():
+                self._put_back(arrived, ~course.called_back)
             self._update_outputs()
         self._forget()
         stopped = StaticReason.TIME_LIMIT if late else StaticReason.ITERATION_LIMIT
@@ -430,6 +434,15 @@ class Statics:
                 torch.where(stays.reshape(-1, *[1] * (view.ndim - 1)), view, old, out=view)
             if name in STEADY:
                 view[stays] = 0.0
+
+    def _remember(self, places: dict[str, torch.Tensor], worlds: np.ndarray[Any, Any]) -> None:
+        """Copy the state of some worlds."""
+        import torch
+
+        if places and worlds.any():
+            chosen = torch.from_numpy(worlds).to(self._views["time"].device)
+            for name, kept in places.items():
+                torch.where(chosen.reshape(-1, *[1] * (kept.ndim - 1)), self._views[name], kept, out=kept)
 
     @contextmanager
     def _standing(self) -> Iterator[None]:

@@ -137,6 +137,7 @@ class Course:
         gone: Way since the start per extent of the scene, shape (world,).
         push: Way per extent that a push gives a world in its next step, shape (world,).
         reason: ``StaticReason`` or ``GOING_ON``, shape (world,).
+        called_back: Whether a world is to stand again where it did when ``has_arrived`` told it last, shape (world,).
     """
 
     def __init__(
@@ -154,6 +155,7 @@ class Course:
         self._tried, self._verified = np.zeros(worlds, dtype=bool), np.zeros(worlds, dtype=bool)
         self._arrival, self._doubted = np.full(worlds, GOING_ON), np.full(worlds, GOING_ON)
         self._doubts, self._strayed = np.zeros(worlds, dtype=int), np.zeros(worlds)
+        self._arrived, self.called_back = np.full(worlds, np.inf), np.zeros(worlds, dtype=bool)
         self._indefinite = np.zeros(worlds, dtype=int)
         self.tolerance, self.levels = tolerance, levels
         self.rounding_way, self.rounding_merit = ROUNDING_WAY[precision], ROUNDING_MERIT[precision]
@@ -256,7 +258,7 @@ class Course:
             self.h[world], self._ceiling[world] = FIRST_STEP, self.longest[world]
             self._last[world] = self._best[world] = self._shortest[world] = np.inf
             self._longest[world], self._stalled[world], self._before[world] = 0.0, 0, 0.0
-            self._doubted[world] = self._arrival[world]
+            self._doubted[world], self._arrived[world] = self._arrival[world], self.way[world]
             self._idle[world] = self._steady[world] = self._saddles[world] = 0
         else:
             self.reason[world] = self._arrival[world]
@@ -264,14 +266,19 @@ class Course:
         return True
 
     def _doubt(self, world: int, way: float) -> None:
-        """A world that stays where it had arrived is no column that buckles: it has arrived."""
+        """A world that stays where it had arrived is no column that buckles: it is called back there."""
         self._strayed[world] += way
         self._doubts[world] += 1
         if self._strayed[world] > STRAYED:
             self._doubted[world] = GOING_ON
         elif self._doubts[world] >= DOUBTS and self.reason[world] in (GOING_ON, StaticReason.NO_EQUILIBRIUM):
             if not (self._leaves(world) or self._grows(world)):
-                self.reason[world] = self._doubted[world]
+                self.reason[world], self.way[world] = self._doubted[world], self._arrived[world]
+                self.called_back[world] = True
+
+    def has_arrived(self) -> Bools:
+        """Worlds that stand where they have arrived, but are doubted and about to leave, shape (world,)."""
+        return (self._doubted != GOING_ON) & (self._doubts == 0)
 
     def _try_other(self, world: int, is_settled: bool, indefinite: bool) -> bool:
         """Whether a step that did not converge is tried again with the other tangent, before a shorter one.

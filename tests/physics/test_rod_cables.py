@@ -50,6 +50,11 @@ def test_length_control_finds_the_tension():
     assert held.solve_static().converged.all()
     np.testing.assert_allclose(held.cable_tension[0, 0], TENSION, rtol=1e-6)
     np.testing.assert_allclose(held.rod_x[0], forced.rod_x[0], atol=1e-8)
+    change = 1e-8  # m; the rod is doubted where it arrives, leaves, and is called back to where it was
+    held.reset()
+    held.control.cable_displacement[:] = forced.cable_displacement + change
+    assert held.solve_static().converged.all()
+    np.testing.assert_allclose(held.cable_tension[0, 0] - TENSION, 108.4 * change, rtol=1e-3)
 
 
 @pytest.mark.parametrize(("worlds", "precision"), [(1, "float64"), (9, "float32")])

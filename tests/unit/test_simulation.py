@@ -60,6 +60,7 @@ def test_exact_systems_are_refused_where_the_tangent_is_not_known():
 
 
 BY_SCENE = {"further_passes", "skin"}  # chosen where contact_passes is not given
+INSIDE = {"gpu_path", "turning_tangent"}  # for tests and statics
 GIVEN = {
     "integrator": "bdf2",
     "newton_iterations": 3,
@@ -85,7 +86,7 @@ def test_every_option_reaches_the_solver():
     build_cart_stem_scene(CartStemSceneConfig(), builder)
     model = builder.finalize(1)
     default, given = sw.Simulation(model), sw.Simulation(model, **GIVEN)
-    assert {field.name for field in dataclasses.fields(Options)} == {*GIVEN, "gpu_path", *BY_SCENE}
+    assert {field.name for field in dataclasses.fields(Options)} == {*GIVEN, *INSIDE, *BY_SCENE}
     for name, value in GIVEN.items():
         assert getattr(default.options, name) != value, f"{name}: choose a value that is not the default"
         assert [getattr(system.options, name) for system in given._systems] == [value], name
