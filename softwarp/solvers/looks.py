@@ -109,8 +109,10 @@ class FurtherLooks:
         def act() -> None:
             self.mark()
             self._skip(self.contact.contacts.idle)
-            look()
-            self._skip(None)
+            try:
+                look()
+            finally:
+                self._skip(None)
             for values, before in self.kept:
                 inputs = [self.contact.contacts.idle.real, before.real]
                 self.shard.each_real(self.k.hold, values.real.shape[1], inputs, [values.real])

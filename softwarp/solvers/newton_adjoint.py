@@ -118,6 +118,8 @@ class NewtonAdjoint(StageAdjoint):
         held = self.gradients
         for part in parts:
             part.gradients = self.aside
-        yield
-        for part in parts:
-            part.gradients = held
+        try:
+            yield
+        finally:
+            for part in parts:
+                part.gradients = held
