@@ -278,7 +278,8 @@ class Course:
 
     def has_arrived(self) -> Bools:
         """Worlds that stand where they have arrived, but are doubted and about to leave, shape (world,)."""
-        return (self._doubted != GOING_ON) & (self._doubts == 0)
+        found: Bools = (self._doubted != GOING_ON) & (self._doubts == 0)
+        return found
 
     def _try_other(self, world: int, is_settled: bool, indefinite: bool) -> bool:
         """Whether a step that did not converge is tried again with the other tangent, before a shorter one.
