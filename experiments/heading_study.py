@@ -152,4 +152,5 @@ def main(argv: Sequence[str] | None = None) -> list[Turn]:
 
 
 if __name__ == "__main__":
-    main()
+    with notices.telling():
+        main()
