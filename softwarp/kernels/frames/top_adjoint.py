@@ -72,6 +72,23 @@ def functions(variant: Variant) -> SimpleNamespace:
         return real(0.5) * (q[3] * by_u + wp.cross(u, by_u) - by_q[3] * u)
 
     @wp.func
+    def to_compound(
+        share: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        frame: int,
+        m: real,
+        centre: vec3,
+        by_centre: vec3,
+        inverse: mat33,
+        by_J: mat33,
+        by_inverse: mat33,
+    ):
+        """Add gradients by centre, inertia and its inverse to the share of what a compound of mass m is made of."""
+        total = by_J - wp.transpose(inverse) * by_inverse * wp.transpose(inverse)
+        add_share(share, pack, lane, frame, m, centre, by_centre, real(0.5) * (total + wp.transpose(total)))
+
+    @wp.func
     def pull(
         q0: quat,
         V: vec3,
@@ -99,8 +116,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         g0, gV, gw, gc, gJ, gi, gh, gx, gq, gv, g1 = wp.grad(value)(
             q0, V, w, centre, J, inverse, h, by_x, by_q, by_v, by_w
         )
-        by_J = gJ - wp.transpose(inverse) * gi * wp.transpose(inverse)
-        add_share(share, pack, lane, frame, m, centre, gc, real(0.5) * (by_J + wp.transpose(by_J)))
+        to_compound(share, pack, lane, frame, m, centre, gc, inverse, gJ, gi)
         return turn_of(q0, g0), gV, gw
 
     @wp.func
@@ -171,8 +187,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         g0, gV0, gw0, g1, gV1, gw1, gc, gJ, gi, gf, gl, gx, gq, gv, gw = wp.grad(extrapolated)(
             q0, V0, w0, q1, V1, w1, centre, J, inverse, factor, lapse, by_x, by_q, by_v, by_w
         )
-        by_J = gJ - wp.transpose(inverse) * gi * wp.transpose(inverse)
-        add_share(share, pack, lane, frame, m, centre, gc, real(0.5) * (by_J + wp.transpose(by_J)))
+        to_compound(share, pack, lane, frame, m, centre, gc, inverse, gJ, gi)
         return turn_of(q0, g0), gV0, gw0, turn_of(q1, g1), gV1, gw1
 
     @wp.kernel(module=variant.module("adjoint.frames"), enable_backward=True)
