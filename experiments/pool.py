@@ -146,7 +146,8 @@ def run_on_ray(wanted: Sequence[Job], cluster: Cluster) -> list[Job]:
 
 def show(running: Sequence[Job], waiting: int) -> None:
     """How far the runs are."""
-    told = ", ".join(f"{job.folder.name} {job.steps or 0:,}" for job in running[:8])
+    shared = os.path.commonpath([job.folder.parent for job in running]) if running else ""
+    told = ", ".join(f"{job.folder.relative_to(shared)} {job.steps or 0:,}" for job in running[:8])
     notices.progress("training", f"{waiting} runs waiting; environment steps saved: {told}")
 
 
