@@ -48,7 +48,8 @@ class Call:
                 groups[group][own].copy_(value)
         model = worlds.model
         is_placed = any(name.startswith(("state.body", "state.rod")) for name in self.tensors)
-        if is_placed and (model.joints is not None or (model.frames is not None and model.frames.welded_frame.size)):
+        leads = model.joints is not None or (model.frames is not None and model.frames.welded_frame.size)
+        if (is_placed and leads) or "state.mode_q" in self.tensors:
             worlds.refresh()
 
     def command(self, step: int) -> None:

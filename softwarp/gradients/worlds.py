@@ -10,7 +10,7 @@ import warp as wp
 from softwarp import interop
 from softwarp.gradients.rows import RowDirections
 from softwarp.model.codes import Status
-from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, MEMORIES, STATE, Gradients
+from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, MEMORIES, MODES, STATE, Gradients
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
@@ -189,6 +189,8 @@ class DifferentiableWorlds:
             self.names, memory = (*self.names, *JOINTS), (*memory, *JOINT_MEMORY)
         if model.relaxes:
             self.names = (*self.names, *MEMORIES)
+        if model.reduction is not None:
+            self.names = (*self.names, *MODES)
         self.memory = tuple(name for name in memory if name not in self.names)
         self._index = index = AdjointIndex.of(model)
         self._twins = twins = sim.make_twins(*room.worlds)
@@ -271,6 +273,7 @@ class DifferentiableWorlds:
             self.model.has_moving_frames
             or self.model.relaxes
             or self.model.membranes is not None
+            or self.model.reduction is not None
             or not self.solution_bytes
         ):
             self._directions = RowDirections(self)
