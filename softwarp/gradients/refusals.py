@@ -56,11 +56,11 @@ def require_static_gradient(sim: Simulation) -> None:
     if sim.model.has_moving_frames:
         for found in _resting_frames(sim):
             raise ValueError(f"gradients.Equilibrium: {found}; take a Rollout with damping that comes to rest")
-    if sim.model.membranes is not None:
-        told = f"equilibria with membrane {sim.model.membranes.names[0]!r} have no gradient yet"
-        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     if sim.model.reduction is not None:
         told = "equilibria of reduced bodies have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
+    if sim.model.membranes is not None:
+        told = f"equilibria with membrane {sim.model.membranes.names[0]!r} have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     for found in _parts(sim.model):
         raise ValueError(f"gradients.Equilibrium: {found}; or fit without gradients, by softwarp.identification")

@@ -10,7 +10,7 @@ import torch
 
 from softwarp import checks
 from softwarp.advice import nearest
-from softwarp.gradients.calls import Call, Plan, check_adrift, check_steps, push
+from softwarp.gradients.calls import Call, Plan, check_adrift, check_steps, check_unsure, push
 from softwarp.gradients.refusals import require_differentiable, require_directions
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
@@ -71,9 +71,9 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra, reduced or not, with cables and chambers, rods, rigid bodies, and joints;
-            backward Euler or, without contact, BDF2, with one linearisation per step or, without contact and joints,
-            as many as solve it. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra, reduced or not, with cables and chambers, rods, rigid
+            bodies, and joints; backward Euler or, without contact, BDF2, with one linearisation per step or, without
+            contact and joints, as many as solve it. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -93,6 +93,10 @@ class Rollout:
         if rest and sim.model.has_moving_frames:
             told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
+        if rest and sim.model.reduction is not None:
+            raise ValueError(
+                "gradients.Rollout: rest shapes have no gradient beside reduced bodies; leave rest=True out"
+            )
         self.worlds = DifferentiableWorlds(sim, rest=rest)
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = Markers(sim.model, self.worlds.state["node_x"])
@@ -299,6 +303,7 @@ class _Steps(torch.autograd.Function):
         if room is not None:
             worlds.give_back(room)
         check_adrift(worlds)
+        check_unsure(worlds)
         found = {f"control.{name}": by for name, by in by_commands.items()}
         found |= {name: gradients[name.removeprefix("state.")].clone() for name in wanted if name.startswith("state.")}
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}

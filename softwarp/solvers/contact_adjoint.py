@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.rows import contact_adjoint, touch_adjoint, touch_gather
+from softwarp.model import memory
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.multipliers import ContactMultipliers
 from softwarp.solvers.system import System
@@ -54,6 +55,7 @@ class ContactAdjoint:
         u: Velocities of the first solution, where contacts have been looked at at the end of its way.
         normal: Normals of contacts there.
         force: Gradients by the forces of contacts, in their axes.
+        unsure: Not 0 in worlds where contacts repeat each other while one slips, until somebody clears it.
         way: h H p of contacts and ``force``, which friction has a gradient by.
     """
 
@@ -65,12 +67,13 @@ class ContactAdjoint:
         assert system.contact is not None
         self.system, self.h, self.gradients = system, h, gradients
         self.laws, self.contacts, self.shard = system.multipliers.laws, system.contact.contacts, system.shard
-        self.pairs = system.contact.pairs
+        self.pairs, self.subspace = system.contact.pairs, system.contact.subspace
         s = self.shard
         self.k = contact_adjoint.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
         self.spare, self.offset, self.way, self.force = (s.rows(3 * self.contacts.capacity) for _ in range(4))
         self.detector = system.contact.detector
+        self.unsure = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self._prepare_touches()
         self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
 
@@ -98,6 +101,7 @@ class ContactAdjoint:
             first: Whether it is the first one that is differentiated; sides are there else.
         """
         c, s = self.contacts, self.shard
+        self._expand(v)
         self.z.zero()
         if first:
             c.first.zero()
@@ -133,18 +137,25 @@ class ContactAdjoint:
             gaps(laws.gap)
         inputs = [laws.static_rows, laws.order, c.count.real, laws.matrix.real, w.compliance.real, c.compliance.real]
         inputs += [active.real, self.mode.real, c.mu.real, laws.gap.real, self.offset.real]
-        outputs = [self.matrix.real, laws.change.real, q.real, self.z.real]
+        outputs = [self.matrix.real, laws.change.real, q.real, self.z.real, self.unsure]
         s.each_real(self.k.solve, None, inputs, outputs)
         laws.add_change(y, -h)
 
+    def _expand(self, *velocities: Rows) -> None:
+        """Velocities of nodes of reduced bodies, behind those of the dofs that they follow from."""
+        if self.subspace is not None:
+            self.subspace.expand(*velocities)
+
     def _known_gaps(self, p: Rows) -> None:
         c = self.contacts
+        self._expand(p)
         inputs = [self.laws.static_rows, self.h, c.count.real, *self._rows(), p.real, self.force.real]
         self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [self.laws.gap.real])
 
     def find_way(self, p: Rows, way: Rows) -> None:
         """h H p of all contacts, and what ``force`` has."""
         c = self.contacts
+        self._expand(p)
         inputs = [0, self.h, c.count.real, *self._rows(), p.real, self.force.real]
         self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [way.real])
 
@@ -190,6 +201,7 @@ class ContactAdjoint:
     def _motion(self, p: Rows) -> tuple[Any, Any]:
         """Where everything is and how it moves, and the velocities of dofs."""
         s, w, fields = self.shard, self.shard.work, self.fields
+        self._expand(p, w.dof_v, self.u)
         fields.p, fields.v, fields.v0, fields.u = p.real, w.dof_v.real, w.dof_v0.real, self.u.real
         return self.detector.places(w.x, w.pose, s.input["v0"], s.input["twist0"]), fields
 

@@ -267,8 +267,10 @@ class ReductionTerm(Term):
 
         Args:
             rest: What is added to the first sum, (listed, 3).
-            one, other: Factors of wide modes.
-            first, second: Receive the sums, by nodes.
+            one: Factors of wide modes.
+            other: Likewise.
+            first: Receives the sum by nodes of one.
+            second: Of the other.
         """
         s, inputs, count = self.shard, [*self._basis(), rest, one.S, other.S], int(self.model.node.size)
         if self.k_place is not None:
