@@ -143,10 +143,6 @@ def _parts(model: Model) -> Iterator[str]:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
     if model.frames is not None:
         yield from _frames(model, model.frames)
-    if model.relaxes and model.joints is not None:
-        body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
-        told = f"the relaxation of body {model.body_names[body]!r} beside joints has no gradient yet"
-        yield f"{told}; leave its Maxwell branch out"
 
 
 def _frames(model: Model, frames: FrameModel) -> Iterator[str]:

@@ -401,7 +401,7 @@ class StepAdjoint:
         if self.leaning is not None:
             self.leaning.velocities(self.node_v)
             self.leaning.push(self.seed, self.q)
-            if self.contact is not None:
+            if self.contact is not None and self.leaning.multiply is None:
                 self.contact.add_forces(self.leaning.pushed)
         if self.frames is not None:
             self.frames.lift(self.element_v, self.node_p)
