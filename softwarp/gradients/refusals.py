@@ -133,8 +133,9 @@ def _contacts(sim: Simulation) -> Iterator[str]:
                 yield f"{told}, as that of {kind}; take a shape, a mesh or a soft body for {one.name!r}"
         if not {a.kind, b.kind} & {*SOFT, Target.SPHERE}:
             yield f"{told}, as that of two rigid bodies, of which only balls have one"
-        if len(np.asarray(contact.topology.carrier)):
-            yield f"{told}, as a surface of its own stands for a soft body; leave collision meshes out"
+        carrier = np.asarray(contact.topology.carrier, dtype=np.int32)
+        if carrier.size and (np.asarray(contact.topology.node_frame)[carrier] >= 0).any():
+            yield f"{told}, as a collision mesh is on nodes that a body carries; leave collision meshes out"
 
 
 def _parts(model: Model) -> Iterator[str]:

@@ -29,7 +29,7 @@ SIZES = {
         "cavity_gas": 1e-11,
     },
     "parameters": {
-        "youngs": 1.0,
+        "youngs": 100.0,
         "nu": 1e-5,
         "density": 1e-2,
         "rayleigh_mass": 1e-3,
@@ -64,6 +64,8 @@ def slab(
     mu: float = 0.7,
     softness: float = 0.0,
     beside: bool = False,
+    skin: bool = False,
+    whole: bool = False,
     air: str = "volume",
     **options: Any,
 ) -> sw.Simulation:
@@ -78,10 +80,14 @@ def slab(
         mu: Friction of the contact.
         softness: Its compliance [m/N].
         air: Control of the chamber; but for "volume" the cable's is its tension, and pressures have a rate.
+        skin: Whether a coarse surface of its own touches for it.
+        whole: Whether it is not reduced.
         beside: Whether a soft body that is not reduced hangs on the same scene.
         **options: Of the simulation.
     """
-    builder = scene(held=not on, contact=False, law=law, lone=air != "volume")
+    surface = meshing.box((0.06, 0.03, 0.012), (4, 2, 2)) if skin else None
+    shown = None if surface is None else (surface.nodes, surface.surface())
+    builder = scene(held=not on, contact=False, law=law, lone=air != "volume", skin=shown)
     if air != "volume":
         shell = meshing.compact(AIR.nodes + (0.01, 0.005, 0.003), AIR.surface())
         limits = {"max_pressure_rate": 2e4} if air == "pressure" else {}
@@ -89,7 +95,8 @@ def slab(
         builder.add_cable(0, [(x, 0.015, 0.009) for x in (0.06, 0.03, 0.0)], control="force")
     weights = np.random.default_rng(0).uniform(0.5, 1.5, len(SLAB.tets))
     weights[::3] = 0.0
-    builder.reduce(0, reduced_by(smooth_modes(held=not on), tet_weight=weights))
+    if not whole:
+        builder.reduce(0, reduced_by(smooth_modes(held=not on), tet_weight=weights))
     other = None
     if on == "ball":
         other = builder.add_rigid(sw.Sphere(0.02), kinematic=True, pose=(0.031, 0.0152, -0.0203))
@@ -118,7 +125,7 @@ def given_of(sim: sw.Simulation, seeds: list[int], *, nodes: bool = False) -> In
         rng = np.random.default_rng(seed)
         ramp = np.arange(1.0, STEPS + 1.0)[:, None] * rng.uniform(0.8, 1.2)
         values: dict[str, dict[str, Any]] = {
-            "state": {"mode_q": 1e-4 * rng.standard_normal(size), "mode_v": 0.03 * rng.standard_normal(size)},
+            "state": {},
             "controls": {
                 "node_force": 0.02 * rng.standard_normal((sim.model.node_count, 3)),
             },
@@ -129,6 +136,8 @@ def given_of(sim: sw.Simulation, seeds: list[int], *, nodes: bool = False) -> In
         values["controls"]["cavity_pressure"] = np.array([[300.0], [310.0], [320.0]]) * rng.uniform(0.9, 1.1)
         if sim.params.cavity_max_pressure_rate[0, 0] < 1e6:  # else it is a first guess only
             values["state"]["cavity_pressure"] = rng.uniform(40.0, 60.0, 1)
+        if size:
+            values["state"] = {"mode_q": 1e-4 * rng.standard_normal(size), "mode_v": 0.03 * rng.standard_normal(size)}
         if nodes:
             values["state"]["node_x"] = sim.node_x[0].cpu().numpy() + 1e-4 * rng.standard_normal(sim.node_x[0].shape)
             values["state"]["node_v"] = 0.03 * rng.standard_normal(sim.node_x[0].shape)
@@ -164,6 +173,10 @@ TOUCHING = {
     "on a ball": partial(slab, on="ball"),
     "slipping on an edge": partial(slab, on="floor", softness=SOFTNESS),
     "on a soft bed": partial(slab, on="bed", softness=SOFTNESS),
+    "of a skin that slips": partial(slab, on="floor", softness=SOFTNESS, skin=True),
+    "of a skin on a ball": partial(slab, on="ball", softness=SOFTNESS, skin=True),
+    "not reduced, of a skin that slips": partial(slab, on="floor", skin=True, whole=True),
+    "not reduced, of a skin on a ball": partial(slab, on="ball", skin=True, whole=True),
 }
 SCENES = {
     "held": slab,
@@ -267,12 +280,12 @@ def test_friction_that_is_not_unique_is_told() -> None:
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("on", ["", "ball"])
+@pytest.mark.parametrize("on", ["", "ball", "skin"])
 def test_a_gpu_finds_the_same(on: str) -> None:
     """To what sums in another order and contacts that are iterated leave."""
     found = []
     for device in ("cpu", "cuda:0"):
-        sim = slab(2, device=device, on=on)
+        sim = slab(2, device=device, on="ball" if on == "skin" else on, skin=on == "skin", softness=SOFTNESS)
         found.append(gradients(Rollout(sim), given_of(sim, [1, 2]), loss))
     for group, held in found[0].items():
         for name, value in held.items():
