@@ -57,7 +57,7 @@ class ContactAdjoint:
         u: Velocities of the first solution, where contacts have been looked at at the end of its way.
         normal: Normals of contacts there.
         force: Gradients by the forces of contacts, in their axes.
-        unsure: Not 0 in worlds where contacts repeat each other while one slips, until somebody clears it.
+        unsure: Not 0 in worlds whose equations have no solution, until somebody clears it.
         way: h H p of contacts and ``force``, which friction has a gradient by.
     """
 

@@ -26,6 +26,10 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import SLOTS
 
 SLIPS = {wp.float64: 1.0e-8, wp.float32: 1.0e-4}  # relative distance of friction from its bound up to which it slips
+UNSOLVED = {
+    wp.float64: 1.0e-7,
+    wp.float32: 1.0e-3,
+}  # relative size of what rounding may leave of equations that repeat others
 DEPENDENT = {wp.float64: 1.0e-13, wp.float32: 1.0e-6}  # relative pivot of a row that repeats others
 
 
@@ -82,7 +86,7 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
     module = variant.module("directional.laws" if forward else "adjoint.contact")
     one = single.functions(variant)
     vec3, vector_at = one.vec3, one.vector_at
-    dependent = DEPENDENT[real]
+    dependent, unsolved = DEPENDENT[real], UNSOLVED[real]
     found = functions(variant)
     motion, along = found.motion, found.along
 
@@ -272,7 +276,8 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
     ):
         """Changes of q and z, and their sums, by Gauss' elimination; rows that repeat others get none.
 
-        Where some do while a contact slips, forces may be shared otherwise with another friction: ``unsure``.
+        Where equations that repeat others contradict them, as contacts that slip and share a load in many ways with
+        other friction may, nothing solves them: ``unsure``.
         """
         pack, lane = wp.tid()
         total = rows + 3 * count_in[pack, 0, lane]
@@ -297,6 +302,12 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 matrix_out,
                 change_out,
             )
+        scale = real(0.0)
+        for i in range(total):
+            known = real(0.0)
+            if i >= rows:
+                known = delassus_in[pack, i * order + i, lane] * z_out[pack, i - rows, lane]
+            scale = wp.max(scale, wp.max(wp.abs(change_out[pack, i, lane]), wp.abs(known)))
         rank = int(0)  # rows that have a pivot, each in its column; a column without one repeats those before it
         for k in range(total):
             largest = int(rank)
@@ -320,9 +331,9 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 rank += 1
             else:
                 matrix_out[pack, k * order + k, lane] = real(0.0)
-                for contact in range(count_in[pack, 0, lane]):
-                    if mode_in[pack, 4 * contact, lane] == real(2.0):
-                        unsure_out[pack, 0, lane] = 1
+        for i in range(rank, total):  # 0 = 0, or there is no solution
+            if wp.abs(change_out[pack, i, lane]) > real(wp.static(unsolved)) * scale:
+                unsure_out[pack, 0, lane] = 1
         for back in range(total):
             i = total - 1 - back
             value = real(0.0)
