@@ -279,7 +279,7 @@ class DifferentiableWorlds:
             or self.model.relaxes
             or self.model.membranes is not None
             or self.model.reduction is not None
-            or (self.model.contact is not None and len(self.model.contact.topology.carrier))
+            or (self.model.contact is not None and self.model.contact.topology.has_embedded)
             or not self.solution_bytes
         ):
             self._directions = RowDirections(self)
