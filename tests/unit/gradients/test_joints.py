@@ -61,7 +61,7 @@ def arm(
     soft: bool = False,
     base: str = "world",
     integrator: str = "euler",
-    relaxation: tuple[float, float] | None = None,
+    relaxation: tuple[float, float] = (0.0, 0.0),
 ) -> sw.Simulation:
     """Two links, the first on a hinge; the second one may carry a soft finger.
 
