@@ -16,11 +16,13 @@ AIR = meshing.box((0.04, 0.02, 0.006), (2, 2, 1))
 CLAMPED = SLAB.nodes[:, 0] < 1e-9
 
 
-def scene(*, held: bool, contact: bool, law: Any = None, lone: bool = False) -> sw.ModelBuilder:
-    """The slab, not reduced yet; ``lone`` leaves out what is not part of the body."""
+def scene(*, held: bool, contact: bool, law: Any = None, lone: bool = False, skin: Any = None) -> sw.ModelBuilder:
+    """The slab, not reduced yet; ``lone`` leaves out what is not part of the body, ``skin`` is what touches for it."""
     builder = sw.ModelBuilder()
     material = law or sw.Corotational(1e5, 0.3)
-    slab = builder.add_tets(SLAB, material=material, density=1000.0, rayleigh=(0.1, 0.01), name="slab")
+    slab = builder.add_tets(
+        SLAB, material=material, density=1000.0, rayleigh=(0.1, 0.01), name="slab", contact_surface=skin
+    )
     if held:
         builder.fix(slab, nodes=np.flatnonzero(CLAMPED))
     builder.add_membrane(slab, BASE, youngs=1e6, nu=0.4, thickness=1e-3, density=1000.0, name="base")

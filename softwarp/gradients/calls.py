@@ -48,7 +48,8 @@ class Call:
                 groups[group][own].copy_(value)
         model = worlds.model
         is_placed = any(name.startswith(("state.body", "state.rod")) for name in self.tensors)
-        if is_placed and (model.joints is not None or (model.frames is not None and model.frames.welded_frame.size)):
+        leads = model.joints is not None or (model.frames is not None and model.frames.welded_frame.size)
+        if (is_placed and leads) or "state.mode_q" in self.tensors:
             worlds.refresh()
 
     def command(self, step: int) -> None:
@@ -111,6 +112,7 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
                     slope[place].copy_(each[name])
     check_steps(call)
     check_adrift(worlds)
+    check_unsure(worlds)
     return kept, slopes
 
 
@@ -154,6 +156,17 @@ def check_adrift(worlds: DifferentiableWorlds) -> None:
         raise Diverged(
             f"rollout: the gradient of a step of Newton's method in world {found[0]} and {len(found) - 1} others is "
             "not found by going on, as near where something buckles; take a shorter dt, or newton_iterations=1"
+        )
+
+
+def check_unsure(worlds: DifferentiableWorlds) -> None:
+    """Refuse gradients where forces of contacts are not unique and motions depend on them."""
+    found = worlds.unsure.nonzero().flatten().tolist()
+    if found:
+        raise Diverged(
+            f"rollout: in world {found[0]} and {len(found) - 1} others a reduced body slipped on more contacts than "
+            "its modes tell apart, so that how they share its load is not unique, and friction depends on it; give "
+            "the pair a compliance, or the reduction more modes for contact"
         )
 
 

@@ -19,7 +19,7 @@ class Diverged(RuntimeError):
 
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
-    parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _contacts(sim))
+    parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _reduced(sim), _contacts(sim))
     is_linear = sim.options.newton_iterations == 1
     if sim.options.pressure_tangent and is_linear and sim.model.has_moving_frames:
         told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
@@ -56,6 +56,9 @@ def require_static_gradient(sim: Simulation) -> None:
     if sim.model.has_moving_frames:
         for found in _resting_frames(sim):
             raise ValueError(f"gradients.Equilibrium: {found}; take a Rollout with damping that comes to rest")
+    if sim.model.reduction is not None:
+        told = "equilibria of reduced bodies have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     if sim.model.membranes is not None:
         told = f"equilibria with membrane {sim.model.membranes.names[0]!r} have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
@@ -130,8 +133,9 @@ def _contacts(sim: Simulation) -> Iterator[str]:
                 yield f"{told}, as that of {kind}; take a shape, a mesh or a soft body for {one.name!r}"
         if not {a.kind, b.kind} & {*SOFT, Target.SPHERE}:
             yield f"{told}, as that of two rigid bodies, of which only balls have one"
-        if len(np.asarray(contact.topology.carrier)):
-            yield f"{told}, as a surface of its own stands for a soft body; leave collision meshes out"
+        carrier = np.asarray(contact.topology.carrier, dtype=np.int32)
+        if carrier.size and (np.asarray(contact.topology.node_frame)[carrier] >= 0).any():
+            yield f"{told}, as a collision mesh is on nodes that a body carries; leave collision meshes out"
 
 
 def _parts(model: Model) -> Iterator[str]:
@@ -140,12 +144,6 @@ def _parts(model: Model) -> Iterator[str]:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
     if model.frames is not None:
         yield from _frames(model, model.frames)
-    if model.reduction is not None:
-        yield "reduced bodies have no gradient yet; take the full mesh"
-    if model.relaxes and model.joints is not None:
-        body = int(np.flatnonzero(model.defaults["relaxation_ratio"].ravel())[0])
-        told = f"the relaxation of body {model.body_names[body]!r} beside joints has no gradient yet"
-        yield f"{told}; leave its Maxwell branch out"
 
 
 def _frames(model: Model, frames: FrameModel) -> Iterator[str]:
@@ -174,6 +172,23 @@ def _carriers_of_touching(model: Model, frames: FrameModel, names: list[str]) ->
         if moves and count[frame] > 1:
             told = f"{name}, which moves freely and carries several nodes of a body that touches something"
             yield f"{told}, has no gradient yet; make it kinematic, or leave contact out"
+
+
+def _reduced(sim: Simulation) -> Iterator[str]:
+    """What reduced bodies have no gradient with."""
+    model, told = sim.model, "reduced bodies have no gradient"
+    if model.reduction is None:
+        return
+    if model.reduction.floating is not None:
+        yield f"{told} in a floating frame yet; train the reduction with frame='fixed'"
+    if sim.options.integrator != "euler":
+        yield f"{told} with integrator {sim.options.integrator!r} yet; take integrator='euler'"
+    if sim.options.newton_iterations > 1:
+        yield f"{told} with newton_iterations={sim.options.newton_iterations} yet; take newton_iterations=1"
+    if model.joints is not None:
+        yield f"{told} beside joints yet; take the full mesh"
+    if model.relaxes:
+        yield f"{told} beside Maxwell branches yet; leave these out"
 
 
 def _rods(sim: Simulation) -> Iterator[str]:

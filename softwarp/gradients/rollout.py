@@ -10,11 +10,11 @@ import torch
 
 from softwarp import checks
 from softwarp.advice import nearest
-from softwarp.gradients.calls import Call, Plan, check_adrift, check_steps, push
+from softwarp.gradients.calls import Call, Plan, check_adrift, check_steps, check_unsure, push
 from softwarp.gradients.refusals import require_differentiable, require_directions
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
-from softwarp.model.gradients import COMMANDS, FRAMES, PARAMETERS, STATE
+from softwarp.model.gradients import COMMANDS, FRAMES, MODES, PARAMETERS, STATE
 from softwarp.model.model import Model
 from softwarp.simulation import Simulation
 
@@ -22,7 +22,7 @@ Tensors = Mapping[str, torch.Tensor]
 GROUPS = {"state": "state", "controls": "control", "parameters": "params"}  # arguments, and how a call names them
 STARTS = (
     *("node_x", "node_v", "cavity_pressure", "body_pose", "body_twist"),
-    *("rod_x", "rod_q", "rod_v", "rod_w"),
+    *("rod_x", "rod_q", "rod_v", "rod_w", "mode_q", "mode_v"),
 )
 
 
@@ -43,6 +43,8 @@ class States:
         rod_w: Their angular velocities [rad/s], likewise.
         body_pose: Positions [m] and quaternions of rigid bodies, (state, world, body, 7), where some move or carry.
         body_twist: Their velocities [m/s] and angular velocities [rad/s], (state, world, body, 6).
+        mode_q: Amplitudes [m] of the modes of reduced bodies, (state, world, mode).
+        mode_v: Their velocities [m/s], likewise.
     """
 
     step: torch.Tensor
@@ -57,6 +59,8 @@ class States:
     rod_w: torch.Tensor
     body_pose: torch.Tensor
     body_twist: torch.Tensor
+    mode_q: torch.Tensor
+    mode_v: torch.Tensor
 
 
 class Rollout:
@@ -67,9 +71,9 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra with cables and chambers, rods, rigid bodies, and joints;
-            backward Euler or, without contact, BDF2, with one linearisation per step or, without contact and joints,
-            as many as solve it. Its ``dt`` and options are taken over now.
+        sim: Soft bodies of linear or quadratic tetrahedra, reduced or not, with cables and chambers, rods, rigid
+            bodies, and joints; backward Euler or, without contact, BDF2, with one linearisation per step or, without
+            contact and joints, as many as solve it. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -89,6 +93,10 @@ class Rollout:
         if rest and sim.model.has_moving_frames:
             told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
+        if rest and sim.model.reduction is not None:
+            raise ValueError(
+                "gradients.Rollout: rest shapes have no gradient beside reduced bodies; leave rest=True out"
+            )
         self.worlds = DifferentiableWorlds(sim, rest=rest)
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = Markers(sim.model, self.worlds.state["node_x"])
@@ -119,6 +127,7 @@ class Rollout:
             state: ``node_x`` [m] and ``node_v`` [m/s], each (world, node, 3), and ``cavity_pressure`` [Pa] (world,
                 chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures;
                 ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods;
+                ``mode_q`` [m] and ``mode_v`` [m/s], each (world, mode), of reduced bodies, whose nodes follow;
                 ``body_pose`` and ``body_twist`` of rigid bodies. Those of the simulation where left out.
             controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``body_velocity``
                 [m/s] with spins [rad/s] of kinematic bodies that carry something, ``joint_target`` [m, rad],
@@ -183,6 +192,10 @@ class Rollout:
         if name == "body_velocity" and not self.worlds.model.has_moving_frames:
             told = "it has one only where something is carried, or moves freely beside them"
             raise ValueError(f"controls 'body_velocity' has no gradient: {told}; leave it out")
+        if name in ("node_x", "node_v") and self.worlds.model.reduction is not None:
+            if self.worlds.model.own_node_count == 0:
+                told = "all nodes follow from the modes of reduced bodies"
+                raise ValueError(f"state {name!r} has no gradient: {told}; give mode_{name[-1].replace('x', 'q')!s}")
         if group == "state":
             return fitted(group, name, value, STARTS, views.state)
         if group == "parameters":
@@ -209,6 +222,8 @@ class Rollout:
         pose, twist = (frames[name][..., rods, :] for name in FRAMES)
         bodies = dict(zip(("body_pose", "body_twist"), frames.values(), strict=True))
         parts = {name: value[..., : model.rigid_count, :] for name, value in bodies.items()}
+        modes = dict(zip(self.worlds.names, kept, strict=True))
+        parts |= {name: modes.get(name, x.new_empty((*x.shape[:-2], 0))) for name in MODES}
         parts |= {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
         marked = self._markers(x, frames["frame_pose"] if model.has_moving_frames else None)
         return States(step, x, v, tension, pressure, marked, **parts)
@@ -288,6 +303,7 @@ class _Steps(torch.autograd.Function):
         if room is not None:
             worlds.give_back(room)
         check_adrift(worlds)
+        check_unsure(worlds)
         found = {f"control.{name}": by for name, by in by_commands.items()}
         found |= {name: gradients[name.removeprefix("state.")].clone() for name in wanted if name.startswith("state.")}
         found |= {f"params.{name}": gradients[name].clone() for name in PARAMETERS}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
+import numpy as np
 import torch
 
 from softwarp.model.gradients import FRAMES, PARAMETERS
@@ -63,6 +64,35 @@ class Worlds(Protocol):
         ...
 
 
+class Shapes:
+    """Displacements of the nodes of reduced bodies in their modes.
+
+    Args:
+        model: Scene.
+        like: Precision and device.
+
+    Attributes:
+        node: Nodes of reduced bodies.
+    """
+
+    def __init__(self, model: Model, like: torch.Tensor) -> None:
+        r = model.reduction
+        assert r is not None
+        node, body, start, basis = (part.numpy() for part in (r.node, r.node_body, r.node_basis, r.basis))
+        modes = np.zeros((len(node), 3, r.count))
+        for i, (k, at) in enumerate(zip(body, start, strict=True)):
+            first, end = r.start[k], r.start[k + 1]
+            modes[i, :, first:end] = basis[at : at + 3 * r.stride[k]].reshape(3, -1)[:, : end - first]
+        self.node, self._modes = torch.as_tensor(node, device=like.device).long(), torch.as_tensor(modes).to(like)
+
+    def __call__(self, amplitudes: torch.Tensor) -> torch.Tensor:
+        """Displacements (..., node, 3) from (..., mode); sums one after the other: the same bits in every batch."""
+        total: torch.Tensor = amplitudes[..., 0, None, None] * self._modes[..., 0]
+        for mode in range(1, self._modes.shape[-1]):
+            total += amplitudes[..., mode, None, None] * self._modes[..., mode]
+        return total
+
+
 class RowDirections:
     """Slopes of worlds through a step, by one adjoint for every number of the state at its end.
 
@@ -81,6 +111,10 @@ class RowDirections:
                 carrier = torch.as_tensor(model.frames.node_frame.numpy()[:count]).long()
             self._follows |= (carrier < 0).to(device)
         self._moves = torch.as_tensor(places[:count] >= 0).to(device)
+        self._shapes = None if model.reduction is None else Shapes(model, worlds.gradients["node_x"])
+        if self._shapes is not None:
+            self._follows[self._shapes.node] = True
+            self._moves[self._shapes.node] = False
 
     def step(self, slopes: Sequence[Slopes]) -> list[Slopes]:
         """As ``DifferentiableWorlds.step_along``, without watching."""
@@ -112,6 +146,12 @@ class RowDirections:
         x, v = found["node_x"], found["node_v"]
         before = held["node_x"].reshape(x.shape) if "node_x" in held else torch.zeros_like(x)
         found["node_x"] = torch.where(self._follows[:, None], before + worlds.h * v, x)
+        if self._shapes is not None:
+            found["mode_q"] = worlds.h * found["mode_v"]
+            if "mode_q" in held:
+                found["mode_q"] += held["mode_q"].reshape(found["mode_q"].shape)
+            for nodes, modes in (("node_x", "mode_q"), ("node_v", "mode_v")):
+                found[nodes][..., self._shapes.node, :] = self._shapes(found[modes])
         return [{name: values[number] for name, values in found.items()} for number in range(len(slopes))]
 
     def _stacked(self, slopes: Sequence[Slopes]) -> Slopes:
@@ -139,6 +179,8 @@ class RowDirections:
                 counts &= ~self._follows[:, None]
             elif name == "node_v":
                 counts &= (self._moves | ~self._follows)[:, None]
+            elif name == "mode_q":  # follow from their velocities
+                counts[:] = False
             elif name in FRAMES:  # centres of mass follow from their bodies, and nobody asks for them
                 counts[self.worlds.model.rigid_count + self.worlds.model.rod_node_count :] = False
             for row in counts.flatten().nonzero().flatten().tolist():

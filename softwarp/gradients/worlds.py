@@ -10,7 +10,7 @@ import warp as wp
 from softwarp import interop
 from softwarp.gradients.rows import RowDirections
 from softwarp.model.codes import Status
-from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, MEMORIES, STATE, Gradients
+from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, MEMORIES, MODES, STATE, Gradients
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
@@ -189,6 +189,8 @@ class DifferentiableWorlds:
             self.names, memory = (*self.names, *JOINTS), (*memory, *JOINT_MEMORY)
         if model.relaxes:
             self.names = (*self.names, *MEMORIES)
+        if model.reduction is not None:
+            self.names = (*self.names, *MODES)
         self.memory = tuple(name for name in memory if name not in self.names)
         self._index = index = AdjointIndex.of(model)
         self._twins = twins = sim.make_twins(*room.worlds)
@@ -228,6 +230,11 @@ class DifferentiableWorlds:
             for part in (pull.pulls if isinstance(pull, SecondOrderAdjoint) else [pull])
             if isinstance(part, NewtonAdjoint)
         ]
+        self._unsure = [
+            ((worlds.start, worlds.stop), wp.to_torch(pull.contact.unsure, requires_grad=False).flatten())
+            for (worlds, _), pull in zip(twins, pulls, strict=True)
+            if model.reduction is not None and isinstance(pull, StepAdjoint) and pull.contact is not None
+        ]
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
@@ -245,8 +252,8 @@ class DifferentiableWorlds:
         self.failed.zero_()
         self.unfinished.zero_()
         self.rough.zero_()
-        for _, adrift in self._adrift:
-            adrift.zero_()
+        for _, told in (*self._adrift, *self._unsure):
+            told.zero_()
         self.lagging.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
@@ -271,6 +278,8 @@ class DifferentiableWorlds:
             self.model.has_moving_frames
             or self.model.relaxes
             or self.model.membranes is not None
+            or self.model.reduction is not None
+            or (self.model.contact is not None and self.model.contact.topology.has_embedded)
             or not self.solution_bytes
         ):
             self._directions = RowDirections(self)
@@ -307,9 +316,17 @@ class DifferentiableWorlds:
     @property
     def adrift(self) -> torch.Tensor:
         """Worlds whose gradients did not come to stay since ``start``, bool, (world,)."""
+        return self._told(self._adrift)
+
+    @property
+    def unsure(self) -> torch.Tensor:
+        """Worlds where modes did not tell apart contacts that slipped since ``start``, bool, (world,)."""
+        return self._told(self._unsure)
+
+    def _told(self, held: list[tuple[tuple[int, int], torch.Tensor]]) -> torch.Tensor:
         found = self.failed.new_zeros(self.failed.shape)
-        for (begin, end), adrift in self._adrift:
-            found[begin:end].logical_or_(adrift[: end - begin] != 0)
+        for (begin, end), told in held:
+            found[begin:end].logical_or_(told[: end - begin] != 0)
         return found
 
     def place(self, state: dict[str, torch.Tensor]) -> None:

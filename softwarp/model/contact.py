@@ -195,6 +195,11 @@ class Topology:
     carrier: ArrayLike = ()
     carrier_weight: ArrayLike = ()
 
+    @property
+    def has_embedded(self) -> bool:
+        """Whether there are embedded points."""
+        return np.asarray(self.carrier).size > 0
+
     def places(self, nodes: ArrayLike) -> FloatArray:
         """Positions of nodes [m], shape (node, 3), and after them those of embedded points."""
         x = np.asarray(nodes, dtype=np.float64).reshape(-1, 3)

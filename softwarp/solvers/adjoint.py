@@ -20,10 +20,12 @@ from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.leaning_adjoint import Leaning, LeaningFrames
 from softwarp.solvers.membrane_adjoint import MembraneAdjoint
+from softwarp.solvers.mode_adjoint import ModeAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.membranes import MembraneTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
+from softwarp.solvers.terms.reduction import ReductionTerm
 from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
@@ -71,12 +73,12 @@ class StepAdjoint:
         self.k = adjoint_sums.kernels(s.variant)
         self.k_rows, self.k_chambers = of_rows.kernels(s.variant), cavity_adjoint.kernels(s.variant)
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
-        self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_count)
+        self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_room)
         self.node_v, self.node_p, self.node_mass_p = (s.rows(3 * m.node_count) for _ in range(3))
         self.node_bar = s.rows(3 * m.node_count)
         self.element_v = self.row_v = self.node_v
         self.corner = s.rows(s.work.element_force.real.shape[1])
-        self.tets = self.quadratic = self.skin = None
+        self.tets = self.quadratic = self.skin = self.modes = None
         for term in system.terms:
             if isinstance(term, TetTerm):
                 self.tets = TetAdjoint(s, term.tets.tets, m.tet_count)
@@ -84,6 +86,8 @@ class StepAdjoint:
                 self.quadratic = QuadraticAdjoint(s, term.model, term.points.tets, term.first)
             elif isinstance(term, MembraneTerm):
                 self.skin = MembraneAdjoint(s, term.model)
+            elif isinstance(term, ReductionTerm):
+                self.modes = ModeAdjoint(s, term, h, gradients)
         self.way, self.point = s.rows(3 * points), s.rows(3 * points)
         self.force, self.q, self.change, self.gap, self.compliant, self.bound, self.measured = (
             s.rows(rows) for _ in range(7)
@@ -218,6 +222,8 @@ class StepAdjoint:
             self.leaning.finish(self.node_v, self.node_mass_p, self.p, self.final_v, parameters=parameters)
         if self.contact is not None:
             self.contact.to_state(self.p)
+        if self.modes is not None:
+            self.modes.take()
 
     def _find(self) -> None:
         """p and q of the seed and of the gradients by forces."""
@@ -236,6 +242,8 @@ class StepAdjoint:
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
+        if self.modes is not None:
+            self.modes.seed(self.seed, self.system.linear.y)
         if self.frames is not None:
             self.frames.seed(self.seed, self.system.linear.y, carries=first)
         if self.leaning is not None:
@@ -386,12 +394,14 @@ class StepAdjoint:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
         s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+        if self.modes is not None:
+            self.modes.place(w.dof_v, self.p, self.node_v, self.node_p)
         if self.frames is not None:
             self.frames.carry(self.p, self.node_v, self.node_p)
         if self.leaning is not None:
             self.leaning.velocities(self.node_v)
             self.leaning.push(self.seed, self.q)
-            if self.contact is not None:
+            if self.contact is not None and self.leaning.multiply is None:
                 self.contact.add_forces(self.leaning.pushed)
         if self.frames is not None:
             self.frames.lift(self.element_v, self.node_p)
@@ -433,6 +443,8 @@ class StepAdjoint:
         inputs = [self.h, s.lanes, m.node_body, i["density"].real]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
         s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
+        if self.modes is not None:
+            self.modes.to_state()
         self._to_tractions()
 
     def _to_tractions(self) -> None:
@@ -458,6 +470,8 @@ class StepAdjoint:
             self.skin.to_parameters(self.h, g)
         inputs = [*scalars, m.node_count, m.node_body, x.node_heft, i["density"].real, self.node_p.real]
         s.each_real(self.k.gravity, None, inputs, [g.gravity])
+        if self.modes is not None:
+            self.modes.to_parameters()
         if self.rest is not None:
             self._to_rest(self.rest)
 

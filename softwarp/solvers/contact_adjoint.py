@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.rows import contact_adjoint, touch_adjoint, touch_gather
+from softwarp.kernels.rows import contact_adjoint, embedded_adjoint, touch_adjoint, touch_gather
+from softwarp.model import memory
 from softwarp.model.gradients import Gradients
+from softwarp.solvers.collision.detector import Detector
 from softwarp.solvers.multipliers import ContactMultipliers
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.workspace import rows
 from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
 
 KEPT = (
     "count",
@@ -54,6 +57,7 @@ class ContactAdjoint:
         u: Velocities of the first solution, where contacts have been looked at at the end of its way.
         normal: Normals of contacts there.
         force: Gradients by the forces of contacts, in their axes.
+        unsure: Not 0 in worlds whose equations have no solution, until somebody clears it.
         way: h H p of contacts and ``force``, which friction has a gradient by.
     """
 
@@ -65,12 +69,13 @@ class ContactAdjoint:
         assert system.contact is not None
         self.system, self.h, self.gradients = system, h, gradients
         self.laws, self.contacts, self.shard = system.multipliers.laws, system.contact.contacts, system.shard
-        self.pairs = system.contact.pairs
+        self.pairs, self.subspace = system.contact.pairs, system.contact.subspace
         s = self.shard
         self.k = contact_adjoint.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
         self.spare, self.offset, self.way, self.force = (s.rows(3 * self.contacts.capacity) for _ in range(4))
         self.detector = system.contact.detector
+        self.unsure = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self._prepare_touches()
         self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
 
@@ -88,6 +93,10 @@ class ContactAdjoint:
             kinematic[: frames.rigid_count] = frames.is_kinematic
         self.is_kinematic = wp.array(kinematic, dtype=wp.int32, device=s.device)
         self.look, self.u, self.normal = s.integers(self.contacts.capacity), s.work.dof_v, self.contacts.axes
+        self.embedded = None
+        if detector.embedded_count and not self.forward:
+            self.embedded = EmbeddedPoints(s, detector)
+            self.top.node_dof, self.top.node_frame = self.embedded.node_dof, self.embedded.node_frame
         self.has_moving_frames = s.model.has_moving_frames  # which reads the device, as a recording cannot
 
     def begin(self, v: Rows, *, first: bool = True) -> None:
@@ -98,6 +107,7 @@ class ContactAdjoint:
             first: Whether it is the first one that is differentiated; sides are there else.
         """
         c, s = self.contacts, self.shard
+        self._expand(v)
         self.z.zero()
         if first:
             c.first.zero()
@@ -133,18 +143,25 @@ class ContactAdjoint:
             gaps(laws.gap)
         inputs = [laws.static_rows, laws.order, c.count.real, laws.matrix.real, w.compliance.real, c.compliance.real]
         inputs += [active.real, self.mode.real, c.mu.real, laws.gap.real, self.offset.real]
-        outputs = [self.matrix.real, laws.change.real, q.real, self.z.real]
+        outputs = [self.matrix.real, laws.change.real, q.real, self.z.real, self.unsure]
         s.each_real(self.k.solve, None, inputs, outputs)
         laws.add_change(y, -h)
 
+    def _expand(self, *velocities: Rows) -> None:
+        """Velocities of nodes of reduced bodies, behind those of the dofs that they follow from."""
+        if self.subspace is not None:
+            self.subspace.expand(*velocities)
+
     def _known_gaps(self, p: Rows) -> None:
         c = self.contacts
+        self._expand(p)
         inputs = [self.laws.static_rows, self.h, c.count.real, *self._rows(), p.real, self.force.real]
         self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [self.laws.gap.real])
 
     def find_way(self, p: Rows, way: Rows) -> None:
         """h H p of all contacts, and what ``force`` has."""
         c = self.contacts
+        self._expand(p)
         inputs = [0, self.h, c.count.real, *self._rows(), p.real, self.force.real]
         self.shard.each_real(self.k.known_gaps, c.capacity, inputs, [way.real])
 
@@ -184,15 +201,68 @@ class ContactAdjoint:
         inputs = [s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, motion]
         inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real]
         inputs += [c.multiplier.real, self.mode.real, self.way.real, self.parts.real]
-        outputs = [x_bar, g.node_v, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
+        places = [x_bar, g.node_v] if self.embedded is None else self.embedded.begin()
+        outputs = [*places, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
         s.each_real(self.k_gather.gather, None, inputs, outputs)
+        if self.embedded is not None:
+            self.embedded.spread(x_bar, g.node_v)
 
     def _motion(self, p: Rows) -> tuple[Any, Any]:
         """Where everything is and how it moves, and the velocities of dofs."""
         s, w, fields = self.shard, self.shard.work, self.fields
-        fields.p, fields.v, fields.v0, fields.u = p.real, w.dof_v.real, w.dof_v0.real, self.u.real
+        self._expand(p, w.dof_v, self.u)
+        velocities = [p, w.dof_v, w.dof_v0, self.u]
+        if self.embedded is not None:
+            velocities = self.embedded.velocities(velocities)
+        fields.p, fields.v, fields.v0, fields.u = (part.real for part in velocities)
         return self.detector.places(w.x, w.pose, s.input["v0"], s.input["twist0"]), fields
 
     def _rows(self) -> list[wp.array]:
         c = self.contacts
         return [c.dof.real, c.weight.real, c.lever.real, c.axes.real]
+
+
+class EmbeddedPoints:
+    """Points of collision surfaces as nodes behind all others, with dofs behind all others.
+
+    Args:
+        shard: Worlds.
+        detector: Which has them.
+
+    Attributes:
+        node_dof: Of nodes, and of embedded points.
+        node_frame: Frames that carry nodes; none carries embedded points.
+    """
+
+    def __init__(self, shard: Shard, detector: Detector) -> None:
+        self.shard, self.detector = shard, detector
+        self.k, s = embedded_adjoint.kernels(shard.variant), shard
+        self.dofs, self.nodes, count = s.model.dof_room, detector.node_total, detector.embedded_count
+        dof = np.concatenate([detector.node_dof.numpy(), self.dofs + np.arange(count)])
+        frame = np.concatenate([detector.node_frame.numpy(), np.full(count, -1)])
+        self.node_dof, self.node_frame = (wp.array(part, dtype=wp.int32, device=s.device) for part in (dof, frame))
+        self._held = [s.rows(3 * (self.dofs + count)) for _ in range(4)]
+        size = (s.world_count, 3 * (self.nodes + count))
+        self._x, self._v = (wp.zeros(size, dtype=s.variant.real, device=s.device) for _ in range(2))
+
+    def velocities(self, given: list[Rows]) -> list[Rows]:
+        """Velocities of dofs, and of embedded points behind them."""
+        s, d = self.shard, self.detector
+        for value, held in zip(given, self._held, strict=True):
+            s.place(value, 3 * self.dofs, held, 0)
+            inputs = [self.dofs, d.carrier, d.carrier_weight, d.node_dof]
+            s.each_real(self.k.embed, d.embedded_count, inputs, [held.real])
+        return self._held
+
+    def begin(self) -> list[wp.array]:
+        """Room for gradients by places and velocities of nodes and embedded points, 0 at first."""
+        self._x.zero_()
+        self._v.zero_()
+        return [self._x, self._v]
+
+    def spread(self, x_bar: wp.array, v_bar: wp.array) -> None:
+        """Add what is there now to gradients by nodes."""
+        s, d = self.shard, self.detector
+        for moves, whole, bar in ((False, self._x, x_bar), (True, self._v, v_bar)):
+            inputs = [s.lanes, self.nodes, moves, d.carrier, d.carrier_weight, d.node_dof, whole]
+            s.each_real(self.k.spread, None, inputs, [bar])

@@ -8,17 +8,19 @@ that each has the adjoint of a step without joints. Equations: docs/theory/adjoi
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from softwarp.kernels.frames import gyration_adjoint
 from softwarp.kernels.rows import joint_adjoint
-from softwarp.model.gradients import FRAMES, JOINTS, STATE, Gradients
+from softwarp.model.gradients import FRAMES, JOINTS, MEMORIES, STATE, Gradients
 from softwarp.shapes.base import quaternion_product, rotation_matrix
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.frame_adjoint import FrameAdjoint, lists
+from softwarp.solvers.leaning_adjoint import LeaningFrames
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.joints import JointTerm
 from softwarp.solvers.terms.term import Pace
@@ -51,7 +53,10 @@ class JointStepAdjoint(StepAdjoint):
     @property
     def solution(self) -> list[wp.array]:
         """As of ``StepAdjoint``, with all solutions of the step."""
-        return [*super().solution, *self.joints.solution]
+        kept = super().solution
+        if self.leaning is not None and self.system.options.refinement == 0:  # else it is there
+            kept.append(self.system.work.a.real)
+        return [*kept, *self.joints.solution]
 
     def solve_again(self) -> None:
         """As of ``StepAdjoint``; another stage of the same worlds may have watched the last solve."""
@@ -94,17 +99,21 @@ class JointAdjoint:
         owner.system.watch = self.keep
         self._allocate(dofs, rows)
         self._index()
-        frames.end_v, frames.inertial_v, frames.splits = self.end_v, self.inertial_v, True
+        frames.end_v, frames.splits = self.end_v, True
+        if not isinstance(frames, LeaningFrames):
+            frames.inertial_v = self.inertial_v
+        if owner.leaning is not None:
+            owner.leaning.multiply = self._multiply
         frames.gyrates = self.gyrates
         g = owner.gradients
-        names = [*STATE, *FRAMES, *JOINTS, *(f.name for f in fields(g) if f.name.startswith("command_"))]
+        names = [*STATE, *FRAMES, *JOINTS, *MEMORIES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
         parts = [getattr(g, name) for name in names]
         self.sums = [(part, wp.zeros(part.shape, dtype=part.dtype, device=s.device)) for part in parts if part.size]
 
     def _allocate(self, dofs: int, rows: int) -> None:
         s, frames, term = self.shard, 6 * self.frames.model.count, self.term
         self.end_v, self.inertial_v, self.response, self.needed_response = (s.rows(dofs) for _ in range(4))
-        self.seed, self.seed_kept, self.p_kept, self.still = (s.rows(dofs) for _ in range(4))
+        self.seed, self.seed_kept, self.p_kept, self.still, self.against = (s.rows(dofs) for _ in range(5))
         self.known, self.other, self.twist, self.p_frame, self.drift = (s.rows(frames) for _ in range(5))
         self.free = s.rows(frames)
         self.known_bar, self.bar, self.bar_before, self.place, self.velocity_bar = (s.rows(frames) for _ in range(5))
@@ -275,6 +284,8 @@ class JointAdjoint:
         s.each_real(owner.k.seed, parts, [*scalars, nothing, g.node_v], [frames.kept.real, y])
         s.each_real(owner.k.seed, parts, [*scalars, g.node_x, nothing], [self.seed.real, y])
         frames.seed(self.seed, owner.system.linear.y)
+        if owner.leaning is not None:
+            owner.leaning.seed(self.seed, owner.system.linear.y)
         self._find_shares(frames.kept)
         self.seed_kept.zero()
         self._add(SHARE, 1.0, frames.kept, self.seed_kept)
@@ -415,6 +426,8 @@ class JointAdjoint:
         owner, s, w, frames = self.owner, self.shard, self.shard.work, self.frames
         self.inertial_v.copy_from(w.dof_v)
         self._take(number, self.inertial_v)
+        if isinstance(frames, LeaningFrames):
+            frames.differences = partial(self._take, number)
         own = frames.start, frames.moved, frames.bare
         if not ends:
             frames.start, frames.moved, frames.bare = self.place, self.nothing_moved, self.none
@@ -558,6 +571,14 @@ class JointAdjoint:
         """target += factor share value."""
         inputs = [self.share.real, row, factor, value.real]
         self.shard.each_real(self.k_free.add_scaled, value.real.shape[1], inputs, [target.real])
+
+    def _multiply(self, product: Rows) -> None:
+        """A p of the solution that is pulled."""
+        owner, s, m, w = self.owner, self.shard, self.shard.model, self.shard.work
+        inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.still.S, owner.p.S]
+        s.each(owner.system.k.residual, s.variant.parts(m.dof_count), inputs, [self.against.S])
+        product.zero()
+        self._add(WHOLE, -1.0, self.against, product)
 
     def _zeros(self, like: wp.array) -> wp.array:
         """Zeros of the shape of a state array."""

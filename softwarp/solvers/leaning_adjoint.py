@@ -5,6 +5,8 @@ Equations: docs/theory/adjoint.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import warp as wp
 
 from softwarp.kernels.frames import leaning_adjoint, relaxation_adjoint
@@ -42,6 +44,7 @@ class LeaningFrames(FrameAdjoint):
         self.term = next((term for term in system.terms if isinstance(term, RelaxationTerm)), None)
         self.predicts = predicts
         self.start_v, self.lean, self.felt_v, self.ahead = (s.rows(s.dof_room) for _ in range(4))
+        self.differences: Callable[[Rows], None] | None = None  # takes from velocities what no momentum has
         self.follows = 1.0  # whether such a stage is linearised with the velocities of its start
         self.felt = s.rows(leaning_adjoint.FELT_ROWS * max(model.carried_count, 1))
         self.mind, self.early = s.rows(6 * model.count), s.rows(3 * model.count)
@@ -152,6 +155,7 @@ class Leaning:
         self.still = s.rows(s.dof_room)
         self.sums = s.rows(relaxation_adjoint.SUM_ROWS * m.body_count)
         self.value = s.rows(2 * max(m.frame_count, 1))
+        self.multiply: Callable[[Rows], None] | None = None  # A p, where p is not the solution of the seed alone
         self.before = wp.zeros_like(gradients.rayleigh_stiffness)
         self.bare = s.rows(6 * max(m.frame_count, 1)) if frames is None else frames.bare
 
@@ -184,10 +188,15 @@ class Leaning:
             s.each_real(self.k.carried_velocities, f.carried_count, inputs, outputs)
             self.frames.felt_v.copy_from(w.dof_v)
             s.add(self.lean, self.frames.felt_v, s.dof_rows)
+            if self.frames.differences is not None:
+                self.frames.differences(self.frames.felt_v)
 
     def push(self, seed: Rows, q: Rows) -> None:
         """Find s = A p: the seed less what rows have."""
         s, m, w = self.shard, self.model, self.shard.work
+        if self.multiply is not None:
+            self.multiply(self.pushed)
+            return
         wp.copy(self.pushed.real, seed.real)
         if m.row_count:
             inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, q.S, -self.h]

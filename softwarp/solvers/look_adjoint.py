@@ -12,7 +12,7 @@ import warp as wp
 
 from softwarp.kernels.rows import look_adjoint
 from softwarp.model import memory
-from softwarp.model.gradients import FRAMES, MEMORIES, STATE, Gradients
+from softwarp.model.gradients import FRAMES, MEMORIES, MODES, STATE, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.system import System
@@ -38,7 +38,7 @@ class FirstSolution:
         s, capacity = self.shard, self.term.contacts.capacity
         self.k, self.contacts = look_adjoint.kernels(s.variant), self.term.contacts
         self.term.late = s.integers(1)
-        self.u, self.row = s.rows(3 * s.model.dof_count), s.rows(max(s.model.row_count, 1))
+        self.u, self.row = s.rows(3 * s.model.dof_room), s.rows(max(s.model.row_count, 1))
         self.force, self.normal = s.rows(3 * capacity), s.rows(3 * capacity)
         self.look, self.no_look = s.integers(capacity), s.integers(capacity)
         self.any = memory.zeros((1,), wp.int32, s.device)
@@ -62,6 +62,8 @@ class FirstSolution:
         s, w, c, o = self.shard, self.shard.work, self.contacts, self.system.options
         if number == 0:
             self.u.copy_from(w.u)
+            if self.term.subspace is not None:
+                self.term.subspace.expand(self.u)
             if s.model.row_count:
                 self.row.copy_from(w.multiplier)
             inputs = [c.listed.real, c.multiplier.real]
@@ -105,11 +107,11 @@ class LookStepAdjoint(StepAdjoint):
         s = self.shard
         self.first = FirstSolution.of(system, h)
         self.k_look, self.contacts = self.first.k, self.contact.contacts
-        self.v, self.extra = (s.rows(3 * self.model.dof_count) for _ in range(2))
+        self.v, self.extra = (s.rows(3 * self.model.dof_room) for _ in range(2))
         self.ahead = s.rows(3 * self.contacts.capacity)
         self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
         g = gradients
-        names = [*STATE, *FRAMES, *MEMORIES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
+        names = [*STATE, *FRAMES, *MEMORIES, *MODES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
         parts = [(name, getattr(g, name)) for name in names]
         self.sums = {
             name: (part, *(wp.zeros(part.shape, dtype=part.dtype, device=s.device) for _ in range(2)))

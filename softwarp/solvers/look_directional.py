@@ -26,7 +26,7 @@ class LookStepDirection(StepDirection):
         assert self.direction is not None
         s, m = self.shard, self.model
         self.first, self.contacts = FirstSolution.of(system, h), self.direction.contacts
-        self.v, self.row_force = s.rows(3 * m.dof_count), s.rows(max(m.row_count, 1))
+        self.v, self.row_force = s.rows(3 * m.dof_room), s.rows(max(m.row_count, 1))
         self.contact_force, self.end_slope = s.rows(3 * self.contacts.capacity), s.rows(3 * m.node_count)
         self.direction.u, self.direction.normal = self.first.u, self.first.normal
         self.is_first = False

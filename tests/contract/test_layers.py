@@ -38,7 +38,7 @@ LAYERS = (
     ("solvers.adjoint_index",),
     ("solvers.cavity_adjoint", "solvers.contact_adjoint", "solvers.element_adjoint", "solvers.newton_control"),
     ("solvers.frame_adjoint",),
-    ("solvers.leaning_adjoint", "solvers.membrane_adjoint"),
+    ("solvers.leaning_adjoint", "solvers.membrane_adjoint", "solvers.mode_adjoint"),
     ("solvers.adjoint", "solvers.contact_directional"),
     ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
     ("solvers.repeats",),

@@ -26,6 +26,10 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import SLOTS
 
 SLIPS = {wp.float64: 1.0e-8, wp.float32: 1.0e-4}  # relative distance of friction from its bound up to which it slips
+UNSOLVED = {
+    wp.float64: 1.0e-7,
+    wp.float32: 1.0e-3,
+}  # relative size of what rounding may leave of equations that repeat others
 DEPENDENT = {wp.float64: 1.0e-13, wp.float32: 1.0e-6}  # relative pivot of a row that repeats others
 
 
@@ -82,7 +86,7 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
     module = variant.module("directional.laws" if forward else "adjoint.contact")
     one = single.functions(variant)
     vec3, vector_at = one.vec3, one.vector_at
-    dependent = DEPENDENT[real]
+    dependent, unsolved = DEPENDENT[real], UNSOLVED[real]
     found = functions(variant)
     motion, along = found.motion, found.along
 
@@ -238,9 +242,10 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         total: int,
         i: int,
         k: int,
+        first: int,
     ):
-        """Exchange two rows."""
-        for j in range(k, total):
+        """Exchange two rows from a column on."""
+        for j in range(first, total):
             kept = matrix_out[pack, i * order + j, lane]
             matrix_out[pack, i * order + j, lane] = matrix_out[pack, k * order + j, lane]
             matrix_out[pack, k * order + j, lane] = kept
@@ -267,8 +272,13 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         change_out: wp.array3d(dtype=real),
         q_out: wp.array3d(dtype=real),
         z_out: wp.array3d(dtype=real),
+        unsure_out: wp.array3d(dtype=wp.int32),
     ):
-        """Changes of q and z, and their sums, by Gauss' elimination; rows that repeat others get none."""
+        """Changes of q and z, and their sums, by Gauss' elimination; rows that repeat others get none.
+
+        Where equations that repeat others contradict them, as contacts that slip and share a load in many ways with
+        other friction may, nothing solves them: ``unsure``.
+        """
         pack, lane = wp.tid()
         total = rows + 3 * count_in[pack, 0, lane]
         for i in range(total):
@@ -292,32 +302,47 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 matrix_out,
                 change_out,
             )
+        scale = real(0.0)
+        for i in range(total):
+            known = real(0.0)
+            if i >= rows:
+                known = delassus_in[pack, i * order + i, lane] * z_out[pack, i - rows, lane]
+            scale = wp.max(scale, wp.max(wp.abs(change_out[pack, i, lane]), wp.abs(known)))
+        rank = int(0)  # rows that have a pivot, each in its column; a column without one repeats those before it
         for k in range(total):
-            largest = int(k)
-            for i in range(k + 1, total):
+            largest = int(rank)
+            for i in range(rank + 1, total):
                 if wp.abs(matrix_out[pack, i * order + k, lane]) > wp.abs(matrix_out[pack, largest * order + k, lane]):
                     largest = i
-            if largest != k:
-                swap(matrix_out, change_out, pack, lane, order, total, largest, k)
-            pivot = matrix_out[pack, k * order + k, lane]
-            for i in range(k + 1, total):
-                entry = matrix_out[pack, i * order + k, lane]
-                if entry != real(0.0) and pivot != real(0.0):
-                    factor = entry / pivot
-                    for j in range(k + 1, total):
-                        value = matrix_out[pack, i * order + j, lane] - factor * matrix_out[pack, k * order + j, lane]
-                        matrix_out[pack, i * order + j, lane] = value
-                    change_out[pack, i, lane] = change_out[pack, i, lane] - factor * change_out[pack, k, lane]
+            pivot = matrix_out[pack, largest * order + k, lane]
+            if wp.abs(pivot) > real(wp.static(dependent)) * delassus_in[pack, k * order + k, lane]:
+                if largest != rank:
+                    swap(matrix_out, change_out, pack, lane, order, total, largest, rank, k)
+                for i in range(rank + 1, total):
+                    entry = matrix_out[pack, i * order + k, lane]
+                    if entry != real(0.0):
+                        factor = entry / pivot
+                        for j in range(k + 1, total):
+                            from_pivot = factor * matrix_out[pack, rank * order + j, lane]
+                            matrix_out[pack, i * order + j, lane] = matrix_out[pack, i * order + j, lane] - from_pivot
+                        change_out[pack, i, lane] = change_out[pack, i, lane] - factor * change_out[pack, rank, lane]
+                if rank < k:
+                    matrix_out[pack, k * order + k, lane] = real(1.0)  # nobody reads what is below a pivot
+                rank += 1
+            else:
+                matrix_out[pack, k * order + k, lane] = real(0.0)
+        for i in range(rank, total):  # 0 = 0, or there is no solution
+            if wp.abs(change_out[pack, i, lane]) > real(wp.static(unsolved)) * scale:
+                unsure_out[pack, 0, lane] = 1
         for back in range(total):
             i = total - 1 - back
-            value = change_out[pack, i, lane]
-            for j in range(i + 1, total):
-                value -= matrix_out[pack, i * order + j, lane] * change_out[pack, j, lane]
-            pivot = matrix_out[pack, i * order + i, lane]
-            if wp.abs(pivot) > real(wp.static(dependent)) * delassus_in[pack, i * order + i, lane]:
-                value = value / pivot
-            else:
-                value = real(0.0)
+            value = real(0.0)
+            if matrix_out[pack, i * order + i, lane] != real(0.0):
+                rank -= 1
+                value = change_out[pack, rank, lane]
+                for j in range(i + 1, total):
+                    value -= matrix_out[pack, rank * order + j, lane] * change_out[pack, j, lane]
+                value = value / matrix_out[pack, rank * order + i, lane]
             change_out[pack, i, lane] = value
             if i < rows:
                 q_out[pack, i, lane] = q_out[pack, i, lane] + value

@@ -262,17 +262,29 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.place(count)
 
-    def _place_all(self) -> None:
-        """Positions and velocities of all listed nodes."""
-        s, m, w = self.shard, self.model, self.shard.work
-        self._widen(w.mode_q, w.wide_q)
-        self._widen(w.mode_v, w.wide_v)
-        inputs, count = [*self._basis(), m.node_rest, w.wide_q.S, w.wide_v.S], int(m.node.size)
+    def place_both(self, rest: wp.array, one: Rows, other: Rows, first: Rows, second: Rows) -> None:
+        """Two sums of modes at all listed nodes.
+
+        Args:
+            rest: What is added to the first sum, (listed, 3).
+            one: Factors of wide modes.
+            other: Likewise.
+            first: Receives the sum by nodes of one.
+            second: Of the other.
+        """
+        s, inputs, count = self.shard, [*self._basis(), rest, one.S, other.S], int(self.model.node.size)
         if self.k_place is not None:
             items = -(-count // mode_places.NODES)
-            s.each(self.k_place.node_states, items, [count, *inputs], [w.x.S, w.reduced_v.S])
+            s.each(self.k_place.node_states, items, [count, *inputs], [first.S, second.S])
         else:
-            s.each(self.k.node_states, count, inputs, [w.x.S, w.reduced_v.S])
+            s.each(self.k.node_states, count, inputs, [first.S, second.S])
+
+    def _place_all(self) -> None:
+        """Positions and velocities of all listed nodes."""
+        m, w = self.model, self.shard.work
+        self._widen(w.mode_q, w.wide_q)
+        self._widen(w.mode_v, w.wide_v)
+        self.place_both(m.node_rest, w.wide_q, w.wide_v, w.x, w.reduced_v)
         if self.frames is not None:
             self.frames.place(int(m.node.size))
             self.frames.velocities()

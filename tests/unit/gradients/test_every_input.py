@@ -263,14 +263,20 @@ SCENES: dict[str, Callable[..., sw.Simulation]] = {
     "touching what is moved": partial(touching, "kinematic"),
     "touching with a memory": partial(touching, relaxes=True),
     "touching beside joints": partial(touching, passes=0),
+    "touching beside joints with a memory": partial(touching, passes=0, relaxes=True),
 }
-ELSEWHERE = ("with a membrane", "touching with a memory")  # quick tests of these are in files of their own
+ELSEWHERE = (
+    "with a membrane",
+    "touching with a memory",
+    "touching beside joints with a memory",
+)  # quick tests of these are in files of their own
 QUIET = 0.1  # part of the sizes at which no step of second order is a rough one
 LOUD = 1.0  # of stages beside joints, which are linearised at their start: at rest a projected tangent has kinks
 REFUSED = {  # what has no gradient with bdf2
     "touching": "contact has no gradient with integrator 'bdf2' yet; take integrator='euler'",
     "touching what is moved": "contact has no gradient with integrator 'bdf2' yet; take integrator='euler'",
     "touching with a memory": "contact has no gradient with integrator 'bdf2' yet; take integrator='euler'",
+    "touching beside joints with a memory": "contact has no gradient with integrator 'bdf2' yet; take",
     "touching beside joints": "contact has no gradient with integrator 'bdf2' yet; take integrator='euler'",
 }
 

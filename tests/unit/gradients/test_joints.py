@@ -35,6 +35,8 @@ SIZES = {
         "nu": 1e-4,  # at a tenth of it rounding is a millionth of the smallest slopes
         "density": 1e-2,
         "rayleigh_stiffness": 1e-6,
+        "relaxation_ratio": 1e-5,
+        "relaxation_time": 1e-6,
     },
 }
 MOTORS: dict[str, dict[str, Any]] = {
@@ -59,6 +61,7 @@ def arm(
     soft: bool = False,
     base: str = "world",
     integrator: str = "euler",
+    relaxation: tuple[float, float] = (0.0, 0.0),
 ) -> sw.Simulation:
     """Two links, the first on a hinge; the second one may carry a soft finger.
 
@@ -70,6 +73,7 @@ def arm(
         soft: Put the finger on.
         base: What the first link hangs from: the world, a moving base or the free end of a rod.
         integrator: Of the simulation.
+        relaxation: Maxwell branch of the finger.
     """
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
     shape = sw.Box((0.1, 0.03, 0.02))
@@ -96,6 +100,7 @@ def arm(
             material=material("large", 1e5, 0.4),
             density=1000.0,
             rayleigh=(0.5, 0.01),
+            relaxation=relaxation,
         )
         builder.attach(finger, box=((0.19, -1, -1), (0.2 + 1e-6, 1, 1)), to=lower)
     model = builder.finalize(num_worlds=num_worlds, precision=precision)  # type: ignore[arg-type]
@@ -130,6 +135,42 @@ def thrown(sim: sw.Simulation, seeds: list[int]) -> Inputs:
 
 
 SLOW = pytest.mark.slow
+
+
+COARSE = {"density": 1.0, "relaxation_time": 1e-5}  # changes of what has the smallest slopes beside memories
+MEMORY = (0.4, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("motor", "options"),
+    [
+        ("weak", {}),
+        pytest.param("none", {}, marks=SLOW),
+        pytest.param("stopped", {}, marks=SLOW),
+        pytest.param("rigid", {}, marks=SLOW),
+        ("servo", {"base": "kinematic"}),
+        pytest.param("servo", {"integrator": "bdf2"}, marks=SLOW),
+        pytest.param("none", {"base": "kinematic", "integrator": "bdf2"}, marks=SLOW),
+    ],
+)
+def test_fingers_with_memories_on_links(motor: str, options: dict[str, Any]) -> None:
+    """A Maxwell branch of what driven links carry."""
+    sim = arm(motor, soft=True, relaxation=MEMORY, **options)
+    check(Rollout(sim), thrown(sim, [1]), loss, {**SIZES, "parameters": SIZES["parameters"] | COARSE})
+
+
+def test_worlds_and_kept_factors_change_no_bit_beside_memories() -> None:
+    """A batch has the gradients of each world alone, whether factors are kept."""
+    batch, single = (arm("weak", num_worlds=count, soft=True, relaxation=MEMORY) for count in (2, 1))
+    together, rollout = gradients(Rollout(batch), thrown(batch, [1, 2]), loss), Rollout(single)
+    for world, seed in enumerate([1, 2]):
+        alone = gradients(rollout, thrown(single, [seed]), loss)
+        kept = gradients(rollout, thrown(single, [seed]), loss, factors=True)
+        for group, held in alone.items():
+            for name, value in held.items():
+                axis = int(group == "controls")
+                assert torch.equal(together[group][name].select(axis, world), value.select(axis, 0)), (group, name)
+                assert torch.equal(kept[group][name], value), (group, name)
 
 
 @pytest.mark.parametrize(

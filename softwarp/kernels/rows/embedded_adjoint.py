@@ -1,0 +1,73 @@
+"""Points of collision surfaces in the adjoint of contacts: nodes of their own, whose motion is that of others.
+
+An embedded point moves with the weighted mean of four nodes. Where contacts are pulled back it has a number behind all
+nodes, and velocities behind those of all dofs; what it has goes to its carriers. Theory: docs/theory/adjoint.md.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra.lanes import Variant, single_worlds
+
+
+@single_worlds
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type, on single worlds: (pack, row, lane)."""
+    real = variant.real
+    module = variant.module("adjoint.embedded")
+    one = single.functions(variant)
+    vec3, vector_at, put = one.vec3, one.vector_at, one.put
+
+    @wp.kernel(module=module, enable_backward=False)
+    def embed(
+        dofs: int,
+        # Model
+        carrier: wp.array2d(dtype=wp.int32),
+        carrier_weight: wp.array2d(dtype=real),
+        node_dof: wp.array(dtype=wp.int32),
+        # Workspace out
+        velocity_out: wp.array3d(dtype=real),
+    ):
+        """Velocity of one embedded point, behind those of the dofs; fixed nodes stand still."""
+        pack, point, lane = wp.tid()
+        total = vec3()
+        for j in range(4):
+            dof = node_dof[carrier[point, j]]
+            if dof >= 0:
+                total += carrier_weight[point, j] * vector_at(velocity_out, pack, lane, 3 * dof)
+        put(velocity_out, pack, lane, 3 * (dofs + point), total)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def spread(
+        lanes: int,
+        nodes: int,
+        moves: bool,
+        # Model
+        carrier: wp.array2d(dtype=wp.int32),
+        carrier_weight: wp.array2d(dtype=real),
+        node_dof: wp.array(dtype=wp.int32),
+        # State
+        whole_in: wp.array2d(dtype=real),
+        # State out
+        bar_out: wp.array2d(dtype=real),
+    ):
+        """Add what nodes and embedded points of one world have to the gradients by nodes.
+
+        Those by velocities (``moves``) are none of fixed nodes.
+        """
+        pack, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < bar_out.shape[0]:
+            for row in range(3 * nodes):
+                bar_out[world, row] = bar_out[world, row] + whole_in[world, row]
+            for point in range(carrier.shape[0]):
+                for j in range(4):
+                    node = carrier[point, j]
+                    if node_dof[node] >= 0 or not moves:
+                        for c in range(3):
+                            share = carrier_weight[point, j] * whole_in[world, 3 * (nodes + point) + c]
+                            bar_out[world, 3 * node + c] = bar_out[world, 3 * node + c] + share
+
+    return SimpleNamespace(embed=embed, spread=spread)

@@ -1,0 +1,80 @@
+"""Reduced bodies in the adjoint of a step: gradients by nodes are of modes. Equations: docs/theory/adjoint.md."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from softwarp.kernels.elements import mode_adjoint, mode_loads, reduction
+from softwarp.model.gradients import Gradients
+from softwarp.model.reduction import ReductionModel
+from softwarp.solvers.terms.reduction import ReductionTerm
+from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
+
+
+class ModeAdjoint:
+    """Modes of the reduced bodies of one shard, in a fixed frame.
+
+    Args:
+        shard: Worlds.
+        term: Their part in a step.
+        h: Step [s].
+        gradients: Arrays of these worlds.
+    """
+
+    def __init__(self, shard: Shard, term: ReductionTerm, h: float, gradients: Gradients) -> None:
+        self.shard, self.term, self.h, self.gradients = shard, term, h, gradients
+        self.model: ReductionModel = term.model
+        m = self.model
+        self.k, self.k_modes = mode_adjoint.kernels(shard.variant), reduction.kernels(shard.variant)
+        self.k_loads = mode_loads.kernels(shard.variant)
+        self.listed, self.wide = shard.rows(3 * int(m.node.size)), shard.rows(m.wide_count)
+        self.wide_v, self.wide_p = shard.rows(m.wide_count), shard.rows(m.wide_count)
+        self.mass_p = shard.rows(m.count)
+        self.start = wp.array(m.start, dtype=wp.int32, device=shard.device)
+        self.at_zero = wp.zeros_like(m.node_rest)
+
+    def take(self) -> None:
+        """Gradients by nodes become those by modes that they follow from."""
+        g = self.gradients
+        for by_nodes, by_modes in ((g.node_x, g.mode_q), (g.node_v, g.mode_v)):
+            self._add(by_nodes, by_modes)
+
+    def _add(self, by_nodes: wp.array, by_modes: wp.array) -> None:
+        """by_modes += Phi' by_nodes, which become 0."""
+        s, m = self.shard, self.model
+        s.each_real(self.k.take_nodes, int(m.node.size), [s.lanes, m.node], [by_nodes, self.listed.real])
+        self.wide.zero()
+        inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
+        items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
+        s.each(self.k_loads.add_forces, items, [*inputs, self.listed.S], [self.wide.S])
+        s.each_real(self.k.add_modes, m.count, [s.lanes, m.mode_wide, self.wide.real], [by_modes])
+
+    def seed(self, seed: Rows, y: Rows) -> None:
+        """Right-hand sides of p, from gradients by the end of a step; those by nodes are taken over first."""
+        self.take()
+        s, m, g = self.shard, self.model, self.gradients
+        inputs = [self.h, s.lanes, m.mode_dof, g.mode_q, g.mode_v]
+        s.each_real(self.k.seed, m.count // 3, inputs, [seed.real, y.real])
+
+    def place(self, v: Rows, p: Rows, node_v: Rows, node_p: Rows) -> None:
+        """Velocities and p of nodes, from those of dofs."""
+        s, m, t = self.shard, self.model, self.term
+        for dofs, wide in ((v, self.wide_v), (p, self.wide_p)):
+            s.each(self.k_modes.widen_dofs, m.wide_count, [m.wide_mode, m.mode_dof, dofs.S], [wide.S])
+        t.place_both(self.at_zero, self.wide_v, self.wide_p, node_v, node_p)
+
+    def to_state(self) -> None:
+        """Gradients by the velocities at the start of the step; needs ``place``."""
+        s, m = self.shard, self.model
+        inputs = [s.lanes, m.block_body, m.block_first, m.block_modes, m.block_volume, m.volume, m.mode_wide]
+        inputs += [s.input["density"].real, self.wide_p.real]
+        s.each_real(self.k.masses, m.count // 3, inputs, [self.gradients.mode_v, self.mass_p.real])
+
+    def to_parameters(self) -> None:
+        """Add the gradients by density, Rayleigh's alpha and gravity; needs ``to_state``."""
+        s, m, i, w, g = self.shard, self.model, self.shard.input, self.shard.work, self.gradients
+        inputs = [self.h, s.lanes, m.body_number, self.start, m.mode_wide, m.heft]
+        inputs += [i["density"].real, w.body_mass.real, i["gravity"].real, i["mode_v0"].real]
+        inputs += [self.wide_v.real, self.wide_p.real, self.mass_p.real]
+        s.each_real(self.k.bodies, None, inputs, [g.density, g.rayleigh_mass, g.gravity])
