@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from softwarp.kernels.rows import end_adjoint
 from softwarp.kernels.rows.touch_adjoint import AT_END
-from softwarp.kernels.step import newton_adjoint, stage_adjoint
+from softwarp.kernels.step import stage_adjoint
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.system import System
@@ -30,7 +31,7 @@ class EndContacts(ContactAdjoint):
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
         super().__init__(system, h, gradients)
         s, g = self.shard, gradients
-        self.k_newton, self.k_stage = newton_adjoint.kernels(s.variant), stage_adjoint.kernels(s.variant)
+        self.k_end, self.k_stage = end_adjoint.kernels(s.variant), stage_adjoint.kernels(s.variant)
         self.look.real.fill_(AT_END)
         self.ahead = s.rows(3 * self.contacts.capacity)
         self.by_x, self.by_pose = wp.zeros_like(g.node_x), wp.zeros_like(g.frame_pose)
@@ -53,11 +54,11 @@ class EndContacts(ContactAdjoint):
         by_v, by_twist, by_command = self.by_start
         outputs = [self.by_x, by_v, self.gradients.pair_mu, self.by_pose, by_twist, by_command]
         self._gather(p, outputs, at_end=False)
-        s.each_real(self.k_newton.add_places, self.by_x.shape[1], [s.lanes, self.by_x], [node_bar.real])
+        s.each_real(self.k_end.add_places, self.by_x.shape[1], [s.lanes, self.by_x], [node_bar.real])
         if there is not None:
             inputs = [s.lanes, self.by_pose, s.work.pose.real]
-            s.each_real(self.k_newton.add_poses, self.by_pose.shape[1] // 7, inputs, [there.real])
-        s.each_real(self.k_newton.ways, c.capacity, [c.count.real, self.parts.real], [self.ahead.real])
+            s.each_real(self.k_end.add_poses, self.by_pose.shape[1] // 7, inputs, [there.real])
+        s.each_real(self.k_end.ways, c.capacity, [c.count.real, self.parts.real], [self.ahead.real])
         self.spare.copy_from(c.multiplier)
         c.multiplier.copy_from(self.ahead)
         self.laws.add_forces(sooner, self.h)

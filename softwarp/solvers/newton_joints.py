@@ -7,8 +7,7 @@ Equations: docs/theory/adjoint.md.
 from __future__ import annotations
 
 from softwarp.kernels.frames import gyration_adjoint
-from softwarp.kernels.rows import joint_adjoint
-from softwarp.kernels.step import newton_adjoint
+from softwarp.kernels.rows import end_adjoint, joint_adjoint
 from softwarp.solvers.joint_sides import JointSides
 from softwarp.solvers.leaning_adjoint import LeaningFrames
 from softwarp.solvers.stage_adjoint import StageAdjoint
@@ -30,7 +29,7 @@ class EndJoints(JointSides):
         self.owner, self.leaning_frames, self.h = owner, frames, owner.h
         s, count = self.shard, max(term.model.count, 1)
         self.k, self.k_free = joint_adjoint.kernels(s.variant), gyration_adjoint.kernels(s.variant)
-        self.k_newton = newton_adjoint.kernels(s.variant)
+        self.k_end = end_adjoint.kernels(s.variant)
         self.kept_v, self.still = s.rows(s.dof_room), s.rows(s.dof_room)
         twists, rows = 6 * frames.model.count, s.model.row_count
         self.twist, self.p_frame, self.drift, self.bar, self.kept_bar = (s.rows(twists) for _ in range(5))
@@ -93,11 +92,11 @@ class EndJoints(JointSides):
         """
         owner, s, w, m = self.owner, self.shard, self.shard.work, self.term.model
         rows = s.model.row_count
-        s.each_real(self.k_newton.of_joints, rows, [self.term.first_row, owner.q.real], [self.q.real])
+        s.each_real(self.k_end.of_joints, rows, [self.term.first_row, owner.q.real], [self.q.real])
         inputs = [s.model.dof_entry_start, s.model.dof_entry, s.model.entry_row, s.model.dof_free, w.row.S, self.q.S]
         s.each(owner.system.rows.k.row_force, s.model.dof_count, [*inputs, self.h], [sooner.S])
         inputs = [self.term.first_row, m.joint_row_start, m.row_kind, m.joint_scale, owner.q.real]
-        s.each_real(self.k_newton.by_coordinates, m.count, inputs, [self.at_end.real, self.at_start.real])
+        s.each_real(self.k_end.by_coordinates, m.count, inputs, [self.at_end.real, self.at_start.real])
         self._to_frames(owner.p, self.p_frame)
         self._of_rows(w.pose, self.p_frame, w.multiplier, owner.q, self.at_end, there)
         self.place.zero()
@@ -128,7 +127,7 @@ class EndJoints(JointSides):
         self.bar.zero()
         inputs = [g, f.frame_dof, s.input["pose0"].real, w.compound.real, owner.p.real]
         s.each_real(self.k_free.momenta, count, inputs, [self.bar.real])
-        s.each_real(self.k_newton.subtract, self.bar.real.shape[1], [self.kept_bar.real], [self.bar.real])
+        s.each_real(self.k_end.subtract, self.bar.real.shape[1], [self.kept_bar.real], [self.bar.real])
         inputs = [self.h, g, s.input["pose0"].real, w.compound.real, self.twist.real, self.drift.real]
         s.each_real(self.k_free.settle, count, inputs, [self.bar.real])
         self.by_twist.zero()
