@@ -155,7 +155,8 @@ def check_adrift(worlds: DifferentiableWorlds) -> None:
     if found:
         raise Diverged(
             f"rollout: the gradient of a step of Newton's method in world {found[0]} and {len(found) - 1} others is "
-            "not found by going on, as near where something buckles; take a shorter dt, or newton_iterations=1"
+            "not found by going on, as near where something buckles, or where contacts repeat each other; take a "
+            "shorter dt, or newton_iterations=1"
         )
 
 

@@ -88,11 +88,6 @@ def _options(sim: Simulation) -> Iterator[str]:
     if options.integrator == "trapezoidal" and sim.model.row_count == 0 and sim.model.contact is None:
         told = "steps of integrator 'trapezoidal' have no gradient yet where they are not those of 'bdf2'"
         yield f"{told}; take integrator='bdf2' or 'euler'"
-    if options.newton_iterations > 1:
-        model, told = sim.model, f"steps of newton_iterations={options.newton_iterations} have no gradient"
-        if model.contact is not None or model.joints is not None:
-            other = "contact" if model.joints is None else "joints"
-            yield f"{told} beside {other} yet; take newton_iterations=1 and a shorter dt"
     if options.repeat_swing < float("inf"):
         told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
         yield f"{told} have no gradient yet; take repeat_swing=inf"
@@ -117,6 +112,8 @@ def _contacts(sim: Simulation) -> Iterator[str]:
     if contact is None:
         return
     scene, passes = contact.scene, sim.options.contact_passes
+    if sim.options.newton_iterations > 1:
+        passes = 0  # its iterations find contacts anew where they lead to
     if passes > 0 and max(passes, sim.options.refinement) + sim.options.further_passes > 1:
         told = f"contact that is measured anew more than once a step (contact_passes={passes}, "
         further = f"{sim.options.further_passes} more in worlds that still move, " if sim.options.further_passes else ""

@@ -72,8 +72,8 @@ class Rollout:
 
     Args:
         sim: Soft bodies of linear or quadratic tetrahedra, reduced or not, with cables and chambers, rods, rigid
-            bodies, and joints; backward Euler or, without contact, BDF2, with one linearisation per step or, without
-            contact and joints, as many as solve it. Its ``dt`` and options are taken over now.
+            bodies, and joints; backward Euler or, without contact, BDF2, with one linearisation per step or as many
+            as solve it. Its ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:

@@ -62,6 +62,7 @@ class StepAdjoint:
     """
 
     predicts = False
+    touches = ContactAdjoint
     pace: Pace | None = None  # what a stage of a longer step does of the commands
 
     def __init__(
@@ -116,7 +117,7 @@ class StepAdjoint:
         if leans:
             self.leaning = leaning = Leaning(system, h, gradients, index, felt)
             self.element_v, self.row_v = leaning.element_v, leaning.row_v
-        self.contact = None if system.contact is None else ContactAdjoint(system, h, gradients)
+        self.contact = None if system.contact is None else self.touches(system, h, gradients)
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
     @property

@@ -188,24 +188,32 @@ class ContactAdjoint:
         self._to_places(p, x_bar, pose_bar, at_end=True)
 
     def _to_places(self, p: Rows, x_bar: wp.array, pose_bar: wp.array, *, at_end: bool) -> None:
-        c, s, o, g = self.contacts, self.shard, self.system.options, self.gradients
-        d = self.detector
+        g = self.gradients
+        self._find_parts(p, self.normal if at_end else self.contacts.axes, 3 if at_end else 9, at_end=at_end)
+        outputs = [x_bar, g.node_v, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
+        self._gather(p, outputs, at_end=at_end)
+
+    def _find_parts(self, p: Rows, normal: Rows, normal_rows: int, *, at_end: bool) -> None:
+        c, s, o, d = self.contacts, self.shard, self.system.options, self.detector
         motion, fields = self._motion(p)
         inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, d.node_total]
-        inputs += [at_end, 3 if at_end else 9, d.scene, self.top, motion, fields, self.look.real]
-        inputs += [(self.normal if at_end else c.axes).real]
+        inputs += [at_end, normal_rows, d.scene, self.top, motion, fields, self.look.real, normal.real]
         inputs += [c.count.real, c.listed.real, c.key.real, d.couple.real]
         inputs += [d.face.real, c.axes.real, c.gap.real, c.restitution.real, c.compliance.real, c.multiplier.real]
         inputs += [self.mode.real, self.z.real]
         s.each_real(self.k_touch.parts, c.capacity, inputs, [self.parts.real])
+
+    def _gather(self, p: Rows, outputs: list[wp.array], *, at_end: bool) -> None:
+        c, s, d = self.contacts, self.shard, self.detector
+        motion, _fields = self._motion(p)
         inputs = [s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, motion]
         inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real]
         inputs += [c.multiplier.real, self.mode.real, self.way.real, self.parts.real]
-        places = [x_bar, g.node_v] if self.embedded is None else self.embedded.begin()
-        outputs = [*places, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
-        s.each_real(self.k_gather.gather, None, inputs, outputs)
+        x_bar, v_bar, *others = outputs
+        places = [x_bar, v_bar] if self.embedded is None else self.embedded.begin()
+        s.each_real(self.k_gather.gather, None, inputs, [*places, *others])
         if self.embedded is not None:
-            self.embedded.spread(x_bar, g.node_v)
+            self.embedded.spread(x_bar, v_bar)
 
     def _motion(self, p: Rows) -> tuple[Any, Any]:
         """Where everything is and how it moves, and the velocities of dofs."""

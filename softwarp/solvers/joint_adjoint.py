@@ -10,16 +10,15 @@ from __future__ import annotations
 from dataclasses import fields
 from functools import partial
 
-import numpy as np
 import warp as wp
 
 from softwarp.kernels.frames import gyration_adjoint
 from softwarp.kernels.rows import joint_adjoint
 from softwarp.model.gradients import FRAMES, JOINTS, MEMORIES, STATE, Gradients
-from softwarp.shapes.base import quaternion_product, rotation_matrix
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
-from softwarp.solvers.frame_adjoint import FrameAdjoint, lists
+from softwarp.solvers.frame_adjoint import FrameAdjoint
+from softwarp.solvers.joint_sides import JointSides
 from softwarp.solvers.leaning_adjoint import LeaningFrames
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.joints import JointTerm
@@ -68,7 +67,7 @@ class JointStepAdjoint(StepAdjoint):
         self.joints.pull(parameters=parameters)
 
 
-class JointAdjoint:
+class JointAdjoint(JointSides):
     """Gradients through the solutions of one system with joints.
 
     Args:
@@ -81,8 +80,8 @@ class JointAdjoint:
     """
 
     def __init__(self, owner: StepAdjoint, term: JointTerm, frames: FrameAdjoint) -> None:
-        self.owner, self.term, self.frames = owner, term, frames
-        self.shard = s = owner.shard
+        super().__init__(owner.shard, term, frames)
+        self.owner, s = owner, owner.shard
         self.h, self.last = owner.h, owner.system.passes
         self.k, self.k_free = joint_adjoint.kernels(s.variant), gyration_adjoint.kernels(s.variant)
         dofs, rows, turning = 3 * s.model.dof_count, s.model.row_count, 6 * max(term.gyrating, 1)
@@ -98,13 +97,11 @@ class JointAdjoint:
         self.solution = [part.real for parts in held for part in parts]
         owner.system.watch = self.keep
         self._allocate(dofs, rows)
-        self._index()
-        frames.end_v, frames.splits = self.end_v, True
+        frames.end_v = self.end_v
         if not isinstance(frames, LeaningFrames):
             frames.inertial_v = self.inertial_v
         if owner.leaning is not None:
             owner.leaning.multiply = self._multiply
-        frames.gyrates = self.gyrates
         g = owner.gradients
         names = [*STATE, *FRAMES, *JOINTS, *MEMORIES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
         parts = [getattr(g, name) for name in names]
@@ -127,34 +124,6 @@ class JointAdjoint:
         self.coordinate, self.no_coordinate = (s.rows(max(term.model.count, 1)) for _ in range(2))
         self.mode = allocate(s.variant, s.world_count, max(term.model.rows, 1), s.device, wp.int32)
         self.nothing_moved = s.rows(self.frames.moved.real.shape[1])
-
-    def _index(self) -> None:
-        s, m = self.shard, self.term.model
-        held = np.zeros(m.rows, dtype=np.int32)
-        held[m.unbounded] = 1
-        self.is_held = wp.array(held, dtype=wp.int32, device=s.device)
-        gyrates = np.zeros(self.frames.model.count, dtype=np.int32)
-        gyrates[m.gyrating_frame.numpy()] = 1
-        self.gyrates = wp.array(gyrates, dtype=wp.int32, device=s.device)
-        pairs, places = self._sides_of_masters()
-        self.joint_frame = wp.array(pairs, dtype=wp.int32, device=s.device)
-        self.joint_place = wp.array(places, dtype=s.variant.real, device=s.device)
-        sides = pairs[m.row_joint.numpy()].ravel()  # 2 row for the parent, 2 row + 1 for the child
-        self.sides = lists(sides, self.frames.model.count, s.device)
-
-    def _sides_of_masters(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames of both sides of joints, (joint, 2), and their places there, (joint, 14), all in those of masters."""
-        m, frames = self.term.model, self.frames.model
-        pairs, places = m.frames.copy(), m.joint_place.numpy().astype(np.float64).reshape(-1, 14)
-        offset = frames.frame_offset.numpy().reshape(-1, 7)
-        for joint, side in np.argwhere(pairs >= 0):
-            frame = pairs[joint, side]
-            if frames.master[frame] != frame:
-                place = places[joint, 7 * side : 7 * side + 7]
-                x = offset[frame, :3] + rotation_matrix(offset[frame, 3:]) @ place[:3]
-                place[:] = np.concatenate([x, quaternion_product(offset[frame, 3:], place[3:])])
-                pairs[joint, side] = frames.master[frame]
-        return pairs, places
 
     def keep(self, number: int) -> None:
         """Keep the solution of one pass of a step."""
@@ -549,11 +518,6 @@ class JointAdjoint:
         inputs += [w.upper_bound.real, self.softness.real, w.multiplier.real]
         outputs = [owner.active.real, w.compliance.real, self.mode.real]
         s.each_real(self.k.row_states, self.term.model.rows, inputs, outputs)
-
-    def _to_frames(self, v: Rows, twist: Rows) -> None:
-        """What dofs have, as twists of frames."""
-        m = self.frames.model
-        self.shard.each_real(self.term.k.gather_twist, m.count, [m.frame_dof, v.real], [twist.real])
 
     def _spread(self, number: int, twist: Rows) -> None:
         """Differences of one solution among the twists of all frames."""

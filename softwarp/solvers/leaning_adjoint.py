@@ -35,6 +35,7 @@ class LeaningFrames(FrameAdjoint):
         mind: Gradients by e y of frames.
         felt_v: Velocities of dofs that inertia resists.
         ahead: Gradients by the velocities of dofs that a stage is linearised with.
+        sooner, there: More of these that others have found, and by place and turn where these velocities lead to.
     """
 
     def __init__(self, system: System, model: FrameModel, h: float, gradients: Gradients, *, predicts: bool) -> None:
@@ -43,7 +44,8 @@ class LeaningFrames(FrameAdjoint):
         self.k_felt, self.k_memory = leaning_adjoint.kernels(s.variant), relaxation_adjoint.kernels(s.variant)
         self.term = next((term for term in system.terms if isinstance(term, RelaxationTerm)), None)
         self.predicts = predicts
-        self.start_v, self.lean, self.felt_v, self.ahead = (s.rows(s.dof_room) for _ in range(4))
+        self.start_v, self.lean, self.felt_v, self.ahead, self.sooner = (s.rows(s.dof_room) for _ in range(5))
+        self.there = s.rows(6 * model.count)
         self.differences: Callable[[Rows], None] | None = None  # takes from velocities what no momentum has
         self.follows = 1.0  # whether such a stage is linearised with the velocities of its start
         self.felt = s.rows(leaning_adjoint.FELT_ROWS * max(model.carried_count, 1))
@@ -108,6 +110,7 @@ class LeaningFrames(FrameAdjoint):
         inputs += [w.body_damping.real, i["pose0"].real, self.start_v.real, self.twist0.real, w.compound.real]
         inputs += [self.felt_v.real, p.real, self.frame_p.real, self.start.real, self.corner.real, self.way.real]
         inputs += [self.items.real, self.felt.real, self.bare.real, self.early.real]
+        inputs += [self.there.real, self.sooner.real]
         outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
         outputs += [self.mind.real, self.ahead.real]
         s.each_real(self.k_felt.frame_gradients, m.count, inputs, outputs)

@@ -16,7 +16,11 @@ from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.leaning_adjoint import LeaningFrames
+from softwarp.solvers.newton_contacts import EndContacts
+from softwarp.solvers.newton_joints import EndJoints
 from softwarp.solvers.stage_adjoint import StageAdjoint
+from softwarp.solvers.terms.joints import JointTerm
+from softwarp.solvers.workspace.rows import Rows
 
 MOST = 400  # times that a gradient goes on
 TOLERANCE = {"float32": 3.0e-6, "float64": 1.0e-12}  # of a gradient: by how much it changes last
@@ -40,6 +44,7 @@ class NewtonAdjoint(StageAdjoint):
     """
 
     follows = 0.0
+    touches = EndContacts
 
     def __init__(self, stepper: ImplicitEuler, gradients: Gradients, index: AdjointIndex) -> None:
         super().__init__(stepper.system, stepper.h, stepper.pace, self._recall, gradients, index)
@@ -49,6 +54,15 @@ class NewtonAdjoint(StageAdjoint):
         self.given, self.total = s.rows(s.dof_rows), s.rows(s.dof_rows)
         self.start_frames = s.rows(6 * max(self.model.frame_count, 1))
         self.control = s.rows(newton_adjoint.ROWS)
+        self.sooner, self.other_seed = s.rows(s.dof_rows), s.rows(s.dof_rows)
+        if self.contact is not None:
+            self.contact.u = self.start_v
+        term = next((term for term in self.system.terms if isinstance(term, JointTerm)), None)
+        self.joints: EndJoints | None = None
+        if term is not None and isinstance(self.frames, LeaningFrames):
+            self.joints = EndJoints(self, term, self.frames)
+        self.keeps_sides = self.contact is not None or self.joints is not None
+        self.is_last = False
         self.left = memory.zeros((1,), wp.int32, s.device)
         self.adrift = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         held: dict[str, Any] = {each.name: getattr(gradients, each.name) for each in fields(gradients)}
@@ -68,21 +82,41 @@ class NewtonAdjoint(StageAdjoint):
         """Take the step to its end, and linearise it there."""
         self.stepper.advance()
         self.found_v.copy_from(self.shard.work.dof_v)
+        joints = self.joints
+        if joints is not None:
+            joints.term.stiffens = False  # A as it is without loads; no end depends on it
         super().solve_again()
+        if joints is not None:
+            joints.term.stiffens = True
+            joints.find_kept(self.final_v)
+
+    def _note_start(self) -> None:
+        if self.joints is not None:
+            self.joints.note_start()
 
     def pull(self, *, parameters: bool = True) -> None:
         """As of ``StepAdjoint``."""
         StepAdjoint._seed(self)
+        if self.joints is not None:
+            self.joints.begin(self.seed)
         if self.frames is not None:
             self.start_frames.copy_from(self.frames.start)
         self.given.copy_from(self.seed)
         self.total.copy_from(self.seed)
         self.control.zero()
+        self.is_last = False
+        if self.keeps_sides:
+            self.solve(0)  # half-solved sides of all rows, and W
         self.left.fill_(1)
         wp.capture_while(self.left, self._go_on)
         self._respond()
         self.to_commands()
+        self.is_last = True
+        if self.joints is not None:
+            self.joints.to_motors()
         self.to_start(parameters=parameters)
+        if self.joints is not None:
+            self.joints.end()
 
     def _go_on(self) -> None:
         """The gradient by the velocities that the step ends with, once more."""
@@ -101,20 +135,44 @@ class NewtonAdjoint(StageAdjoint):
         """p and q of the gradient by these velocities."""
         y = self.system.linear.y
         self.seed.copy_from(self.total)
-        y.zero()
-        self.shard.add(self.total, y, self.shard.dof_rows)
+        if not self.keeps_sides:
+            y.zero()
+            self.shard.add(self.total, y, self.shard.dof_rows)
         if isinstance(self.frames, LeaningFrames):
             self.frames.start.copy_from(self.start_frames)
             self.frames.turn_seed(self.seed, y, self.solved_v)
             self.shard.work.dof_v.copy_from(self.solved_v)
         self.p.zero()
         self.q.zero()
-        self._find()
+        if not self.keeps_sides:
+            self._find()
+            return
+        if self.contact is not None:
+            self.contact.z.zero()
+        for correction in range(1 + self.system.options.refinement):
+            self.solve(1 + correction)  # the sides of rows stand
+
+    def _meet(self) -> Rows:
+        """Add what contacts and joints have where the step ends."""
+        sooner, there = self.sooner, None
+        if isinstance(self.frames, LeaningFrames):
+            there, sooner = self.frames.there, self.frames.sooner
+            there.zero()
+        sooner.zero()
+        if self.joints is not None and there is not None:
+            self.joints.meet(there, sooner, last=self.is_last)
+        if not isinstance(self.contact, EndContacts):
+            return self.seed
+        self.contact.meet(self.p, self.node_bar, there, sooner)
+        self.other_seed.copy_from(self.seed)
+        self.contact.add_forces(self.other_seed)
+        self.shard.add(sooner, self.other_seed, self.shard.dof_rows)
+        return self.other_seed
 
     @contextmanager
     def _aside(self) -> Iterator[None]:
         """Gradients by what the step reads are written where nobody reads them."""
-        parts = [part for part in (self, self.frames, self.leaning) if part is not None]
+        parts = [part for part in (self, self.frames, self.leaning, self.contact) if part is not None]
         held = self.gradients
         for part in parts:
             part.gradients = self.aside

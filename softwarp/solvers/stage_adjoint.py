@@ -14,6 +14,7 @@ from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.leaning_adjoint import LeaningFrames
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
+from softwarp.solvers.workspace.rows import Rows
 
 
 class StageAdjoint(StepAdjoint):
@@ -74,6 +75,7 @@ class StageAdjoint(StepAdjoint):
             self.volume.copy_from(w.cavity_volume)
             self.start_gradient.copy_from(w.point_gradient)
         system.command(h, self.pace)
+        self._note_start()
         if self.leaning is not None:
             self.leaning.load()
         self.predict()
@@ -83,6 +85,8 @@ class StageAdjoint(StepAdjoint):
             self.frames.place()
         system.measure_rows()
         system.row_laws()
+        if self.contact is not None:
+            system.find_contacts(h, moving=True, look=None if self.pace is None else self.pace.look)
 
     def solve_again(self) -> None:
         """Take the stage as far as its solution, from the system's state; the state stays as it is."""
@@ -117,10 +121,18 @@ class StageAdjoint(StepAdjoint):
                 s.each_real(self.k_stage.start_frames, f.model.count, [*inputs, self.start_point.real], [f.start.real])
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
         s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
+        seed = self._meet()
         inputs = [self.h, self.follows, s.lanes, m.node_dof, m.node_body, m.dof_free]
         inputs += [x.node_point_start, x.node_point, x.node_point_weight]
-        inputs += [i["density"].real, s.felt["beta"].real, w.body_mass.real, self.seed.real, self.leaning.pushed.real]
+        inputs += [i["density"].real, s.felt["beta"].real, w.body_mass.real, seed.real, self.leaning.pushed.real]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real, self.start_point.real]
         outputs = [g.node_x, g.node_v, g.command_node_force, self.ahead.real]
         s.each_real(self.k_stage.nodes, m.node_count, inputs, outputs)
         self._to_tractions()
+
+    def _note_start(self) -> None:
+        """Keep what is measured at the start of the stage, before it is where its velocities lead to."""
+
+    def _meet(self) -> Rows:
+        """Add what others have where the stage is linearised, and tell the seed less what they have as solved."""
+        return self.seed

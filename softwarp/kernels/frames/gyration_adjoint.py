@@ -188,6 +188,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("adjoint.gyration")
     one, f = single.functions(variant), functions(variant)
     vec3, vector_at, quat_at, inertia_at, add_to = one.vec3, one.vector_at, one.quat_at, one.inertia_at, one.add_to
+    put = one.put
     axes_of, value, by_matrix = f.axes_of, f.value, f.by_matrix
     add_share = of_parts(variant).add_share
 
@@ -232,6 +233,52 @@ def kernels(variant: Variant) -> SimpleNamespace:
             add_to(before_bar_out, pack, lane, 6 * frame + 3, -by_w)
             add_to(place_out, pack, lane, 6 * frame + 3, turn)
             add_share(share_out, pack, lane, frame, m, c, by_c, by_matrix(Q, moments, by_axes, by_moments))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def settle(
+        h: real,
+        # Model
+        gyrating_frame: wp.array(dtype=wp.int32),
+        # Workspace in
+        pose0_in: wp.array3d(dtype=real),
+        compound_in: wp.array3d(dtype=real),
+        known_in: wp.array3d(dtype=real),
+        before_in: wp.array3d(dtype=real),
+        # Workspace out
+        bar_out: wp.array3d(dtype=real),
+    ):
+        """Make gradients by one body's D those by a D that is found from v - D itself, as where Newton's method ends.
+
+        With G the slopes of D, d(D_r) = G_r (dv - d(D_r)): the part by the spin is (1 + G_r')^-1 (br - G_t' bt).
+        """
+        pack, item, lane = wp.tid()
+        frame = gyrating_frame[item]
+        k = wp.static(COMPOUND_ROWS) * frame
+        m = compound_in[pack, k, lane]
+        w = vector_at(known_in, pack, lane, 6 * frame + 3) - vector_at(before_in, pack, lane, 6 * frame + 3)
+        if m > real(0.0) and wp.length(w) * h < real(wp.static(LARGEST)):
+            c = vector_at(compound_in, pack, lane, k + 1) / m
+            square = wp.dot(c, c) * wp.identity(n=3, dtype=real) - wp.outer(c, c)
+            Q, moments = axes_of(inertia_at(compound_in, pack, lane, k + 4) - m * square)
+            q0 = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+            bt = vector_at(bar_out, pack, lane, 6 * frame)
+            br = vector_at(bar_out, pack, lane, 6 * frame + 3)
+            whole = wp.identity(n=3, dtype=real)
+            left = br
+            for i in range(4):
+                along = vec3()
+                linear = vec3()
+                if i < 3:
+                    along[i] = real(1.0)
+                else:
+                    linear = bt
+                _q, by_w, _c, _a, _m, _h, _t, _r = wp.grad(value)(q0, w, c, Q, moments, h, linear, along)
+                for j in range(3):
+                    if i < 3:
+                        whole[j, i] = whole[j, i] + by_w[j]
+                    else:
+                        left[j] = left[j] - by_w[j]
+            put(bar_out, pack, lane, 6 * frame + 3, wp.inverse(whole) * left)
 
     @wp.kernel(module=module, enable_backward=False)
     def momenta(
@@ -395,6 +442,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         spins=spins,
+        settle=settle,
         momenta=momenta,
         held_gaps=held_gaps,
         shares=shares,

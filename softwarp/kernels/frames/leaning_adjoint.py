@@ -396,6 +396,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         felt_in: wp.array3d(dtype=real),
         bare_in: wp.array3d(dtype=real),
         early_in: wp.array3d(dtype=real),
+        there_in: wp.array3d(dtype=real),
+        sooner_in: wp.array3d(dtype=real),
         # State out
         pose_bar_out: wp.array2d(dtype=real),
         twist_bar_out: wp.array2d(dtype=real),
@@ -409,7 +411,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         ``predicts`` is 1 in a stage, where segments and items act at the pose that ``start_v_in`` lead to, velocities
         of dofs, else 0; forces on a free top act at that of the start. ``follows`` is 1 if these velocities are those
-        of the start; ``ahead`` receives the gradients by them.
+        of the start; ``ahead`` receives the gradients by them. ``there_in`` has more by place and turn at that pose,
+        ``sooner_in`` by these velocities.
         """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane
@@ -439,8 +442,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             J = turned(q, inertia_at(compound_in, pack, lane, k + 4))
             damped = turned(q, inertia_at(compound_in, pack, lane, k + 14))
             lost = wp.quat_rotate(q, vector_at(compound_in, pack, lane, k + 11))
-            place = vec3()  # where the stage is linearised
-            turn = vec3()
+            place = vector_at(there_in, pack, lane, 6 * frame)  # where the stage is linearised
+            turn = vector_at(there_in, pack, lane, 6 * frame + 3)
             place0 = vector_at(start_in, pack, lane, 6 * frame)
             turn0 = vector_at(start_in, pack, lane, 6 * frame + 3)
             linear = vector_at(bare_in, pack, lane, 6 * frame)
@@ -478,6 +481,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 mind_v += vector_at(felt_in, pack, lane, row + 6)
                 mind_w += vector_at(felt_in, pack, lane, row + 9)
             phi = predicts * h * vector_at(start_v_in, pack, lane, r)
+            early_v += vector_at(sooner_in, pack, lane, t)
+            early_w += vector_at(sooner_in, pack, lane, r)
             ahead_v = predicts * (h * place + early_v)
             ahead_w = predicts * (h * jacobian_transposed(phi, turn) + early_w)
             put(ahead_out, pack, lane, t, ahead_v)

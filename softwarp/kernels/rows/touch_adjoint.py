@@ -6,7 +6,8 @@ Contacts have, with the adjoint p of velocities and z of their forces F, in axes
 
 where c_k are the weights of what takes part, r_k its lever if a frame carries it and g* the target of the distance d.
 A contact whose distance d1 was measured where a first solution u leads to has g* - d + d1 - h n.s(u) in the place of
-g*: d1 is of a touch of its own, at the end of that way, where late contacts have everything.
+g*: d1 is of a touch of its own, at the end of that way, where late contacts have everything. What Newton's method has
+found at the end of a step has everything there too, and g*(d - h n.s(u)) with the velocities u of that step.
 Its gradients by normal, distance, places and weights are by hand; those of these by points are Warp's, of
 ``collision.forms``.
 """
@@ -25,11 +26,13 @@ from softwarp.model.codes import Carrier, CoupleColumn, Target
 PARTS, SHAPE = 6, 5
 PLACE, TURN, ARM, WEIGHT, PART_ROWS = 0, 3, 6, 9, 10
 PUSH, BOUNCE, INSET = PARTS * PART_ROWS, PARTS * PART_ROWS + 3, PARTS * PART_ROWS + 6
-ROWS = PARTS * PART_ROWS + 9  # of a contact: its parts, z, by the velocity before, by the inset of its feature
+AHEAD = PARTS * PART_ROWS + 9
+ROWS = AHEAD + 1  # of a contact: its parts, z, by the velocity before, by the inset of its feature, by u along n
 
 # What the normal law of a contact looks at: the start of the step alone, a distance where the first solution leads to
-# too, everything there, that without the way to it as it bounces
-AT_START, MEASURED, LATE, BOUNCED = range(4)
+# too, everything there, that without the way to it as it bounces; everything where a step ends, with the distance that
+# it had before its velocities u took it there
+AT_START, MEASURED, LATE, BOUNCED, AT_END = range(5)
 
 
 @single_worlds
@@ -515,6 +518,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             z,
         )
         by.d = by_d
+        if look == wp.static(AT_END):
+            way_z = -by_d
+            law.way = way_z * t.n
+            rows_out[pack, start + wp.static(AHEAD), lane] = way_z
         if has_law:
             law.before = before
             by_axis = h * (multiplier_in[pack, row, lane] * law.p - z * law.v + way_z * law.u) - before * law.v0

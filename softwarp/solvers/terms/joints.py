@@ -26,6 +26,7 @@ class JointTerm(Term):
 
     refreshes = True
     responds = True
+    stiffens = True  # whether A may have the restoring stiffness of joint forces
 
     def __init__(self, shard: Shard, model: JointModel, frames: FrameModel) -> None:
         super().__init__(shard)
@@ -87,7 +88,7 @@ class JointTerm(Term):
 
     def load_tangent(self, h: float) -> None:
         """Restoring stiffness of joint forces, where chambers have theirs."""
-        if not self.shard.options.pressure_tangent:
+        if not (self.stiffens and self.shard.options.pressure_tangent):
             return
         s, m, w = self.shard, self.model, self.shard.work
         self._measure_load()

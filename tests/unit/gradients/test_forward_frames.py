@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+import softwarp as sw
 from softwarp.gradients import Rollout, States, jvp
 from tests.gradient_cases import STEPS, Inputs, cube, gradients, inputs, weights
 from tests.unit.gradients import test_bodies, test_joints, test_rigid, test_rods
@@ -130,6 +131,25 @@ def test_steps_of_second_order() -> None:
     """BDF2 of a soft cube with cables and a chamber."""
     sim = cube("nh_log", integrator="bdf2", locked=False)
     compare(Rollout(sim), inputs(sim, [1]), weights(sim))
+
+
+@pytest.mark.parametrize("scene", ["tops", *(pytest.param(scene, marks=SLOW) for scene in ("bodies", "rod", "cart"))])
+def test_frames_in_steps_of_second_order(scene: str) -> None:
+    """Tops alone, bodies on cables and a rail, and a rod and a cart that carry a soft beam."""
+    if scene == "tops":
+        sim = test_bodies.alone(integrator="bdf2")
+        compare(Rollout(sim), test_bodies.spun(sim, [1]), test_bodies.loss)
+    elif scene == "bodies":
+        sim = test_bodies.tumbling(integrator="bdf2")
+        compare(Rollout(sim), test_bodies.thrown(sim, [1]), test_bodies.loss)
+    else:
+        sim = second_order(test_rigid.arm(base=scene))
+        compare(Rollout(sim), test_rigid.thrown(sim, [1]), test_rigid.loss)
+
+
+def second_order(sim: sw.Simulation) -> sw.Simulation:
+    """The same scene with steps of ``bdf2``."""
+    return sw.Simulation(sim.model, dt=sim.dt, integrator="bdf2")
 
 
 def test_worlds_beside_change_no_bit() -> None:

@@ -290,7 +290,8 @@ def test_worlds_and_kept_factors_change_no_bit() -> None:
 def test_steps_of_second_order(motor: str, options: dict[str, Any]) -> None:
     """Two stages that are linearised where they start, and motors that go part of their way in each."""
     sim = arm(motor, integrator="bdf2", **options)
-    parameters = SIZES["parameters"] | {"body_mass": 1e-4, "joint_damping": 1e-3, "density": 1.0}  # hardly count
+    damping = 1e-4 if "base" in options else 1e-3  # there it counts, and differences of a tenth of it are not exact
+    parameters = SIZES["parameters"] | {"body_mass": 1e-4, "joint_damping": damping, "density": 1.0}  # hardly count
     check(Rollout(sim), thrown(sim, [1]), loss, {**SIZES, "parameters": parameters})
 
 

@@ -1,6 +1,5 @@
 """Gradients of steps that Newton's method solves, against central differences in float64."""
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 import softwarp as sw
 from softwarp.gradients import Diverged, Rollout
 from tests.gradient_cases import STEPS, cube, gradients, inputs, weights
-from tests.unit.gradients import test_adjoint, test_every_input, test_relaxation, test_rigid, test_touches
+from tests.unit.gradients import test_adjoint, test_every_input, test_relaxation, test_rigid
 from tests.unit.gradients.test_forward_frames import compare
 from tests.unit.gradients.test_rods import check
 
@@ -98,19 +97,6 @@ def test_steps_that_are_not_solved_are_refused() -> None:
     given = inputs(sim, [1])
     with pytest.raises(Diverged, match="iterations of a step ended above their tolerance in world 0"):
         Rollout(sim)(given["state"], given["controls"], given["parameters"])
-
-
-@pytest.mark.parametrize(
-    ("build", "told"),
-    [
-        (lambda: solved(test_every_input.jointed()), "newton_iterations=60 have no gradient beside joints yet"),
-        (lambda: solved(test_touches.on_shape("capsule", "free")), "no gradient beside contact yet"),
-    ],
-)
-def test_what_is_refused(build: Callable[[], sw.Simulation], told: str) -> None:
-    """By name, with the way out."""
-    with pytest.raises(ValueError, match=told):
-        Rollout(build())
 
 
 def test_kept_factors_and_rest_shapes_are_refused() -> None:
