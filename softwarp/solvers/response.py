@@ -18,6 +18,7 @@ from softwarp.kernels.rows import (
     anderson,
     contact,
     contact_force,
+    contact_lanes,
     coulomb,
     coulomb_tiers,
     coulomb_warp,
@@ -244,7 +245,11 @@ class ContactResponse:
         inputs.append(c.compliance.real)
         inputs += [v0.real, v.real, u.real, c.point.real, (c.gap if end is None else end).real, end is not None]
         inputs += [x_scale, share, recovery, bounce_speed]
-        self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
+        if self.variant.lanes > 1:
+            dim = (self.packs, self.capacity)
+            wp.launch(contact_lanes.kernels().known_gap, dim, inputs, [self.gap.real], device=self.device)
+        else:
+            self._each_real(self.k.known_gap, self.capacity, inputs, [self.gap.real])
         self.contact_sides.free_gap(y, x_scale, self.gap)
 
     def solve(
@@ -311,6 +316,8 @@ class ContactResponse:
         if self.variant.world_fastest and are_few:
             inputs.insert(2, c.idle.real)
             self._each_real(self.k_force.gather_force, dofs, inputs, [target.real])
+        elif self.variant.lanes > 1:
+            self._each_world(contact_lanes.kernels().add_force, inputs, [target.real])
         else:
             self._each_real(self.k_force.add_force, None, inputs, [target.real])
 

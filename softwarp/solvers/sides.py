@@ -15,7 +15,7 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.algebra.wide import is_wide
-from softwarp.kernels.rows import contact, contact_panel, contact_strips, contact_wide, looks
+from softwarp.kernels.rows import contact, contact_lanes, contact_panel, contact_strips, contact_wide, looks
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
 from softwarp.solvers.collision.contact_list import ContactList
@@ -103,13 +103,17 @@ class ContactSides:
         self._each_world(self.k_looks.pack_count, inputs, [self.pack_first.S, self.pack_count.S])
 
     def _solve(self, linear: LinearSolver) -> None:
-        c, k = self.contacts, self.k
-        span = [self.pack_first.S, self.pack_count.S]
-        inputs = [self.size, self.path_limit, self.index["parent"], self.dof_free, self.touch, *span, c.dof.real]
-        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
-        self._each(k.find_path, self.capacity, inputs, outputs)
+        self._find_paths()
         self._scatter()
         self._substitute(linear)
+
+    def _find_paths(self) -> None:
+        """Paths of contacts, and sides that are zero."""
+        span = [self.pack_first.S, self.pack_count.S]
+        inputs = [self.size, self.path_limit, self.index["parent"], self.dof_free, self.touch, *span]
+        inputs.append(self.contacts.dof.real)
+        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+        self._each(self.k.find_path, self.capacity, inputs, outputs)
 
     def _substitute(self, linear: LinearSolver) -> None:
         """Y <- L^-1 Y."""
@@ -190,6 +194,20 @@ class StripSides(ContactSides):
     def _allocate(self, symbolic: Symbolic) -> None:
         super()._allocate(symbolic)
         self.strip_start = wp.array(strips.starts(symbolic, contact_strips.WIDTH), dtype=wp.int32, device=self.device)
+
+    def _find_paths(self) -> None:
+        inputs = [self.size, self.path_limit, self.index["parent"], self.dof_free, self.touch.first]
+        inputs += [self.pack_first.S, self.pack_count.S, self.contacts.dof.real]
+        outputs = [self.path_size.S, self.path.S, self.place.S, self.side.S]
+        self._each(contact_lanes.kernels().find_path, self.capacity, inputs, outputs)
+
+    def _scatter(self) -> None:
+        if self.touch.first.size:
+            super()._scatter()
+            return
+        inputs = [self.size, self.path_limit, self.dof_free, self.pack_first.S, self.pack_count.S]
+        inputs += [self.contacts.count.real, *self._rows(), self.place.S]
+        self._each(contact_lanes.kernels().scatter_rows, self.capacity, inputs, [self.side.real])
 
     def _substitute(self, linear: LinearSolver) -> None:
         i = self.index

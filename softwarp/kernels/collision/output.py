@@ -8,6 +8,11 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 NO_PAIR = -1
 
+_COPY_ROW = """
+const size_t size = 3 * out.shape[2] * sizeof(out.data[0]);
+memcpy(&wp::index(out, w, 3 * dof, 0), &wp::index(source, w, 3 * place, 0), size);
+"""
+
 
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
@@ -15,6 +20,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real, world_fastest = variant.real, variant.world_fastest
     vec3 = wp.types.vector(3, real)
     module = variant.module("contact_output")
+
+    @wp.func_native(_COPY_ROW)
+    def copy_row(source: wp.array3d(dtype=real), out: wp.array3d(dtype=real), w: int, place: int, dof: int):
+        """Three entries of all worlds of a pack, on a CPU, where they lie together."""
 
     @wp.kernel(module=module, enable_backward=False)
     def start_velocity(
@@ -30,14 +39,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         dof_v0_out: wp.array3d(dtype=real),
     ):
-        """Velocity of one dof at the start of the step, on a CPU of all of a world."""
+        """Velocity of one dof at the start of the step, on a CPU of all dofs and worlds of a pack."""
         pack, part, lane = wp.tid()
-        first = int(0)
-        last = dof_count
         if wp.static(world_fastest):
-            first = part
-            last = part + 1
-        for dof in range(first, last):
+            dof = part
             slot = dof_node[dof]
             for c in range(3):
                 if slot < node_count:
@@ -46,6 +51,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     dof_v0_out[pack, 3 * dof + c, lane] = mode_v0_in[pack, 3 * (slot - first_mode) + c, lane]
                 else:
                     dof_v0_out[pack, 3 * dof + c, lane] = twist0_in[pack, 3 * (slot - node_count) + c, lane]
+        elif lane == 0:
+            for dof in range(dof_count):
+                slot = dof_node[dof]
+                if slot < node_count:
+                    copy_row(node_v0_in, dof_v0_out, pack, slot, dof)
+                elif slot >= first_mode:
+                    copy_row(mode_v0_in, dof_v0_out, pack, slot - first_mode, dof)
+                else:
+                    copy_row(twist0_in, dof_v0_out, pack, slot - node_count, dof)
 
     @wp.kernel(module=module, enable_backward=False)
     def rebase_gap(

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.rows import places, touch
+from softwarp.kernels.rows import touch
 from softwarp.model.codes import SLOTS
 
 ROUNDING = 4.0  # eps of a contact's largest coordinate, up to which distances measured twice differ by rounding
@@ -40,7 +40,6 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
     rounding = ROUNDING * float(np.finfo(np.float64 if real is wp.float64 else np.float32).eps)
     module = variant.module("contact_together" if together else "contact")
     Touch, first_dof, own_axes, mode_row = vars(touch.functions(variant)).values()
-    unplace, number_places = places.unplace, places.numbering(S)
 
     @wp.func
     def slot_row(
@@ -79,50 +78,46 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
         place_out: wp.array2d(dtype=wp.int32),
         side_out: wp.array2d(dtype=S),
     ):
-        """Path of one contact in ascending order, the place of every dof in it (or -1), and zero right-hand sides."""
+        """Path of one contact in ascending order, the place of every dof in it (or -1), and zero right-hand sides.
+
+        For threads of one world; packs have ``contact_lanes.find_path``.
+        """
         w, contact = wp.tid()
         if wp.static(world_fastest):
             contact, w = wp.tid()
         if contact < pack_first_in[w, 0] or contact >= pack_count_in[w, 0]:
             return
         base = contact * size
-        if wp.static(lanes > 1):
-            unplace(place_out, w, base, size)
-        else:
-            for row in range(size):
-                place_out[w, base + row] = -1
+        for row in range(size):
+            place_out[w, base + row] = -1
         first = size
-        for lane in range(wp.static(lanes)):
-            for slot in range(int(wp.static(SLOTS))):
-                dof = int(-1)
-                if wp.static(world_fastest):
-                    dof = dof_in[0, wp.static(SLOTS) * contact + slot, w]
+        for slot in range(int(wp.static(SLOTS))):
+            dof = int(-1)
+            if wp.static(world_fastest):
+                dof = dof_in[0, wp.static(SLOTS) * contact + slot, w]
+            else:
+                dof = dof_in[w, wp.static(SLOTS) * contact + slot, 0]
+            if dof >= 0:
+                dof = first_dof(modes, size, dof)
+                if dof_free[dof, 0] + dof_free[dof, 1] + dof_free[dof, 2] == real(0.0):
+                    dof = -1
                 else:
-                    dof = dof_in[w, wp.static(SLOTS) * contact + slot, lane]
-                if dof >= 0:
-                    dof = first_dof(modes, size, dof)
-                    if dof_free[dof, 0] + dof_free[dof, 1] + dof_free[dof, 2] == real(0.0):
-                        dof = -1
-                    else:
-                        first = wp.min(first, dof)
-                while dof >= 0:
-                    if place_out[w, base + dof] >= 0:
-                        dof = -1
-                    else:
-                        place_out[w, base + dof] = 0
-                        dof = parent[dof]
+                    first = wp.min(first, dof)
+            while dof >= 0:
+                if place_out[w, base + dof] >= 0:
+                    dof = -1
+                else:
+                    place_out[w, base + dof] = 0
+                    dof = parent[dof]
         k = int(0)
         start = contact * path_limit
-        if wp.static(lanes > 1):
-            k = number_places(place_out, path_out, side_out, w, base, first, size, start)
-        else:
-            for row in range(first, size):
-                if place_out[w, base + row] >= 0:
-                    place_out[w, base + row] = k
-                    path_out[w, start + k] = row
-                    for c in range(9):
-                        side_out[w, 9 * (start + k) + c] = S(real(0.0))
-                    k += 1
+        for row in range(first, size):
+            if place_out[w, base + row] >= 0:
+                place_out[w, base + row] = k
+                path_out[w, start + k] = row
+                for c in range(9):
+                    side_out[w, 9 * (start + k) + c] = S(real(0.0))
+                k += 1
         path_size_out[w, contact] = k
 
     @wp.kernel(module=module, enable_backward=False)
@@ -398,14 +393,12 @@ def kernels(variant: Variant, together: bool = False) -> SimpleNamespace:
     ):
         """Gaps of one contact of one world from the velocities known so far: target of the normal law + s H (v + u).
 
+        For threads of one world; packs have ``contact_lanes.known_gap``.
         ``is_measured`` takes the distance measured where these velocities lead to, if it is less than the linear one by
         more than coordinates round.
         """
         pack, contact, lane = wp.tid()
-        shared = lane
-        if wp.static(lanes > 1):
-            shared = 0
-        if contact >= pack_count_in[pack, 0, shared]:
+        if contact >= pack_count_in[pack, 0, lane]:
             return
         i = row_count + 3 * contact
         if contact >= count_in[pack, 0, lane]:

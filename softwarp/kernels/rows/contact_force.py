@@ -61,7 +61,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         target_out: wp.array3d(dtype=real),
     ):
-        """target += f P H' multiplier of all contacts of one world, in their order."""
+        """target += f P H' multiplier of all contacts of one world, in their order; packs: ``contact_lanes``."""
         pack, lane = wp.tid()
         for contact in range(count_in[pack, 0, lane]):
             for slot in range(int(wp.static(SLOTS))):
