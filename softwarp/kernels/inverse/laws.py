@@ -6,12 +6,16 @@ actuators, v = z + Z x, and the laws are linear inequalities.
 
 from types import SimpleNamespace
 
+import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.inverse import labels
 from softwarp.kernels.inverse.labels import CONTACT_LAWS
 from softwarp.model.codes import FAR, ContactLabel, RowLabel
+
+FIRM = 1.0e-9  # part of W's diagonal that is added to it, as contacts may share their forces in more than one way
+ROUNDING = 100.0  # roundings of W's entries that this has to be above
 
 
 @single_worlds
@@ -20,6 +24,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = wp.float64
     narrow = variant.real
     module = variant.module("pivoting")
+    firm = max(FIRM, ROUNDING * float(np.finfo(np.float32 if narrow == wp.float32 else np.float64).eps))
     matrix_row = labels.kernels(variant).matrix_row
 
     @wp.func
@@ -148,7 +153,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 system_out[w, f * width + f] += real(compliance_in[pack, i, lane])
             elif (k - rows) % 3 == 0:
                 system_out[w, f * width + f] += real(softness_in[pack, (k - rows) // 3, lane])
-            system_out[w, f * width + f] += wp.abs(system_out[w, f * width + f]) * real(1.0e-9)
+            system_out[w, f * width + f] += wp.abs(system_out[w, f * width + f]) * real(wp.static(firm))
         last = free + n + 1
         for f in range(free):
             best = int(f)
