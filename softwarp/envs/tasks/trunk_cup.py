@@ -48,7 +48,7 @@ from __future__ import annotations
 
 import functools
 from importlib import resources
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -73,9 +73,11 @@ from softwarp.envs.tasks.cable_reach import (
 from softwarp.meshing.cup_geometry import BOTTOM_RADIUS, HEIGHT
 from softwarp.render import Camera
 from softwarp.simulation import Simulation
+from softwarp.solvers.inverse.grip import Grip
 
 CABLES = LONG_CABLES + SHORT_CABLES
 CONTACT_CAPACITY = 160
+GRIP = 0.5  # N of all contacts, which inverse control keeps; twenty times the cup's weight
 
 # Compact observation: name, entries, divisor to order 1.
 COMPACT = (
@@ -110,10 +112,6 @@ class TrunkCup(CableReach):
     config: TrunkCupConfig
     scene: TrunkCupScene
 
-    # Of ``InverseController``: m that a grasp follows without slipping; with less weight of the tensions, opposite
-    # cables pull against each other ever more, until the cup is lost.
-    steering: ClassVar[dict[str, Any]] = {"max_step": 0.004, "energy": 0.03}
-
     @property
     def gravity(self) -> tuple[float, float, float]:
         """Acceleration of the scene [m/s^2]."""
@@ -123,6 +121,15 @@ class TrunkCup(CableReach):
     def contact_capacity(self) -> int:
         """Twice as many as a firm grasp has, for eight corners to a rim."""
         return CONTACT_CAPACITY * -(-self.config.skin_corners // 8)
+
+    @property
+    def steering(self) -> dict[str, Any]:
+        """Of ``InverseController``.
+
+        m that a grasp follows without slipping. With less weight of the tensions, opposite cables pull against each
+        other ever more, until the cup is lost; a grip keeps that weight from letting the cup go, which weighs 0.024 N.
+        """
+        return {"max_step": 0.004, "energy": 0.03, "grip": Grip(self.scene.hold, least=GRIP)}
 
     def build_scene(self, builder: ModelBuilder) -> None:
         """Trunk, clamp, cables, cup."""

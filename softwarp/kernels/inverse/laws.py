@@ -398,4 +398,45 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 high_out[w, above] = mu * system_in[w, push + n] - system_in[w, response + n]
                 low_out[w, above + 1] = -mu * system_in[w, push + n] - system_in[w, response + n]
 
-    return SimpleNamespace(free_rows=free_rows, eliminate=eliminate, respond=respond, inequalities=inequalities)
+    @wp.kernel(module=module, enable_backward=False)
+    def grip(
+        n: int,
+        rows: int,
+        width: int,
+        pair: int,
+        least: real,
+        most: real,
+        row: int,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        pair_in: wp.array3d(dtype=wp.int32),
+        free_in: wp.array2d(dtype=wp.int32),
+        free_count_in: wp.array2d(dtype=wp.int32),
+        system_in: wp.array2d(dtype=real),
+        # Workspace out
+        normal_out: wp.array2d(dtype=real),
+        low_out: wp.array2d(dtype=real),
+        high_out: wp.array2d(dtype=real),
+    ):
+        """The sum of a pair's normal forces as a row of the quadratic program, without bounds where nothing touches."""
+        w = wp.tid()
+        lanes = count_in.shape[2]
+        free = free_count_in[w, 0]
+        for a in range(n):
+            normal_out[w, row * n + a] = real(0.0)
+        known = real(0.0)
+        touches = bool(False)
+        for f in range(free):
+            k = free_in[w, f] - rows
+            if k >= 0 and k % 3 == 0:
+                if pair_in[w // lanes, k // 3, w % lanes] == pair:
+                    touches = True
+                    known += system_in[w, f * width + free + n]
+                    for a in range(n):
+                        normal_out[w, row * n + a] += system_in[w, f * width + free + a]
+        low_out[w, row] = wp.where(touches, least - known, -real(wp.static(FAR)))
+        high_out[w, row] = wp.where(touches, most - known, real(wp.static(FAR)))
+
+    return SimpleNamespace(
+        free_rows=free_rows, eliminate=eliminate, respond=respond, inequalities=inequalities, grip=grip
+    )
