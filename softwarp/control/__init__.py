@@ -7,10 +7,12 @@ from softwarp.control.policy import InversePolicy, Steerable, SteerableTubes
 from softwarp.control.tilt import TiltController
 from softwarp.control.tubes import TubeController, TubeSolution
 from softwarp.model.codes import Outcome
+from softwarp.solvers.inverse.grip import Grip
 
 __all__ = [
     "Effector",
     "Followed",
+    "Grip",
     "InverseController",
     "InversePolicy",
     "OrientationEffector",

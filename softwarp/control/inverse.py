@@ -21,6 +21,7 @@ from softwarp.model.fields import allocate
 from softwarp.plan.compile import coupled
 from softwarp.simulation import Simulation
 from softwarp.solvers.inverse.actuators import CABLE, CHAMBER, JOINT
+from softwarp.solvers.inverse.grip import Grip
 from softwarp.solvers.inverse.problem import InverseOptions
 from softwarp.solvers.inverse.system import EQUILIBRIUM, InverseSystem
 from softwarp.threads import alone
@@ -85,6 +86,7 @@ class InverseController:
             under length control as the only actuators, on soft bodies alone.
         contact: Let contacts answer to what the actuators do. False leaves them out of the prediction: what is touched
             by things that weigh next to nothing, as a ball in a maze, is steered faster, and as well.
+        grip: What the robot holds by friction, and how firmly. None lets the energy that it costs loosen the grip.
 
     Raises:
         ValueError: For effectors or actuators that do not exist, or a setting outside its range.
@@ -107,6 +109,7 @@ class InverseController:
         tolerance: float = 1.0e-4,
         settle: float | None = None,
         contact: bool = True,
+        grip: Grip | None = None,
     ) -> None:
         self.sim = sim
         model = sim.model
@@ -130,7 +133,9 @@ class InverseController:
             tolerance=_positive(tolerance, "tolerance"),
             settle=0.0 if settle is None else _positive(settle, "settle"),
             contact=checks.flag(contact, "inverse control: contact"),
+            grip=grip,
         )
+        self._check_grip()
         self.actuators = plan_actuators(model, cables, chambers, joints)
         if horizon == math.inf:
             self._check_equilibrium()
@@ -153,6 +158,16 @@ class InverseController:
         ]
         self._is_compiled = False
         self._graphs: list[Any] | None = None
+
+    def _check_grip(self) -> None:
+        """A grip needs contacts that answer, and a pair that is there."""
+        grip, pairs = self.options.grip, self.sim.model.pair_count
+        if grip is None:
+            return
+        if not pairs or not self.options.contact:
+            raise ValueError("inverse control: a grip needs contacts that are looked at: a contact pair, contact=True")
+        if grip.pair >= pairs:
+            raise ValueError(f"inverse control: grip: pair must be below the scene's {pairs}, got {grip.pair}")
 
     def _check_equilibrium(self) -> None:
         """Without its motor a joint moves freely: no equilibrium is near the state from which predictions start."""

@@ -149,7 +149,8 @@ def test_cup_comes_to_place_and_axis() -> None:
     """Two points of the cup, the middles of bottom and rim, have a target each, none of which is met at the start.
 
     Contacts, with friction, are rows of the problem that inverse control solves.
-    Six of eight poses come within 5 mm and 10 degrees in six seconds, the median within 3 mm and 3 degrees.
+    Six of eight poses come within 5 mm and 10 degrees in six seconds, the median within 3 mm and 3 degrees. The cup is
+    nowhere predicted to be far from where poses are.
     """
     env = registry.make("TrunkCup", num_worlds=8, seed=0)
     assert isinstance(env, TrunkCup)
@@ -162,9 +163,11 @@ def test_cup_comes_to_place_and_axis() -> None:
     effectors = [PointEffector(env.scene.bottom_markers), PointEffector(env.scene.rim_markers)]
     controller = InverseController(env.sim, effectors, period=env.control_dt, **env.steering)
     targets = torch.stack((place - 0.5 * HEIGHT * axis, place + 0.5 * HEIGHT * axis), dim=1)
+    farthest = 0.0  # m, from the target
     for _ in range(round(6.0 / env.control_dt)):
-        controller.solve(targets)
+        farthest = max(farthest, float(controller.solve(targets).error.max()))
         env.sim.step(env.action_repeat)
+    assert farthest < 0.06
     distance = env.measure_distance()
     assert not bool(env.is_dropped().any())
     assert int(env.is_success(distance).sum()) >= 6

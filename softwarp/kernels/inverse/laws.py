@@ -6,12 +6,16 @@ actuators, v = z + Z x, and the laws are linear inequalities.
 
 from types import SimpleNamespace
 
+import numpy as np
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.inverse import labels
 from softwarp.kernels.inverse.labels import CONTACT_LAWS
 from softwarp.model.codes import FAR, ContactLabel, RowLabel
+
+FIRM = 1.0e-9  # part of W's diagonal that is added to it, as contacts may share their forces in more than one way
+ROUNDING = 100.0  # roundings of W's entries that this has to be above
 
 
 @single_worlds
@@ -20,6 +24,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = wp.float64
     narrow = variant.real
     module = variant.module("pivoting")
+    firm = max(FIRM, ROUNDING * float(np.finfo(np.float32 if narrow == wp.float32 else np.float64).eps))
     matrix_row = labels.kernels(variant).matrix_row
 
     @wp.func
@@ -148,7 +153,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 system_out[w, f * width + f] += real(compliance_in[pack, i, lane])
             elif (k - rows) % 3 == 0:
                 system_out[w, f * width + f] += real(softness_in[pack, (k - rows) // 3, lane])
-            system_out[w, f * width + f] += wp.abs(system_out[w, f * width + f]) * real(1.0e-9)
+            system_out[w, f * width + f] += wp.abs(system_out[w, f * width + f]) * real(wp.static(firm))
         last = free + n + 1
         for f in range(free):
             best = int(f)
@@ -393,4 +398,45 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 high_out[w, above] = mu * system_in[w, push + n] - system_in[w, response + n]
                 low_out[w, above + 1] = -mu * system_in[w, push + n] - system_in[w, response + n]
 
-    return SimpleNamespace(free_rows=free_rows, eliminate=eliminate, respond=respond, inequalities=inequalities)
+    @wp.kernel(module=module, enable_backward=False)
+    def grip(
+        n: int,
+        rows: int,
+        width: int,
+        pair: int,
+        least: real,
+        most: real,
+        row: int,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        pair_in: wp.array3d(dtype=wp.int32),
+        free_in: wp.array2d(dtype=wp.int32),
+        free_count_in: wp.array2d(dtype=wp.int32),
+        system_in: wp.array2d(dtype=real),
+        # Workspace out
+        normal_out: wp.array2d(dtype=real),
+        low_out: wp.array2d(dtype=real),
+        high_out: wp.array2d(dtype=real),
+    ):
+        """The sum of a pair's normal forces as a row of the quadratic program, without bounds where nothing touches."""
+        w = wp.tid()
+        lanes = count_in.shape[2]
+        free = free_count_in[w, 0]
+        for a in range(n):
+            normal_out[w, row * n + a] = real(0.0)
+        known = real(0.0)
+        touches = bool(False)
+        for f in range(free):
+            k = free_in[w, f] - rows
+            if k >= 0 and k % 3 == 0:
+                if pair_in[w // lanes, k // 3, w % lanes] == pair:
+                    touches = True
+                    known += system_in[w, f * width + free + n]
+                    for a in range(n):
+                        normal_out[w, row * n + a] += system_in[w, f * width + free + a]
+        low_out[w, row] = wp.where(touches, least - known, -real(wp.static(FAR)))
+        high_out[w, row] = wp.where(touches, most - known, real(wp.static(FAR)))
+
+    return SimpleNamespace(
+        free_rows=free_rows, eliminate=eliminate, respond=respond, inequalities=inequalities, grip=grip
+    )

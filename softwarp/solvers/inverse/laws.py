@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.inverse import labels, laws
+from softwarp.model.codes import FAR
 from softwarp.solvers.inverse.problem import InverseProblem
 
 PIVOTS = 8  # changes of labels that are tried in one solve
@@ -70,6 +71,20 @@ class Laws:
         inputs += [w.lower_bound.real, w.upper_bound.real, c.mu.real]
         inputs += [self.label, self.free, self.free_count, self.matrix, self.gradient]
         p.each_world(self.k.inequalities, inputs, [p.normal, p.low, p.high])
+        if (grip := p.options.grip) is not None:
+            inputs = [
+                n,
+                self.rows,
+                self.width,
+                grip.pair,
+                grip.least,
+                min(grip.most, FAR),
+                2 * n + p.laws,
+                c.count.real,
+                c.pair.real,
+            ]
+            inputs += [self.free, self.free_count, self.matrix]
+            p.each_world(self.k.grip, inputs, [p.normal, p.low, p.high])
 
     def pivot(self, *, first: bool, last: bool) -> None:
         """Keep or take back the last change of labels, and try another one."""

@@ -16,12 +16,14 @@ from softwarp.kernels.algebra.lanes import variant
 from softwarp.kernels.inverse import effector, labels
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.inverse.actuators import ActuatorBounds, ActuatorPlan
+from softwarp.solvers.inverse.grip import Grip
 from softwarp.solvers.response import ContactResponse
 from softwarp.solvers.subspace import touch_struct
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import rows
 
 SOFTNESS = 1.0e-6  # squared distance of an effector that is worth as much as that of a displacement from its bound
+GRIP_SOFTNESS = 1.0e4  # N^2/m^2, likewise: a newton that a grip lacks is worth a centimetre
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class InverseOptions:
         tolerance: Distance to a target that counts as none [m].
         settle: Distance to a target below which the exact sensitivity in equilibrium leads [m]; 0 does without.
         contact: Whether contacts answer to what the actuators do.
+        grip: What the robot holds by friction.
     """
 
     horizon: float
@@ -83,6 +86,7 @@ class InverseOptions:
     tolerance: float
     settle: float = 0.0
     contact: bool = True
+    grip: Grip | None = None
 
 
 class InverseProblem:
@@ -167,7 +171,7 @@ class InverseProblem:
 
     def _allocate(self) -> None:
         shard, n, e, wide = self.system.shard, self.actuators.count, self.effector_rows, self.doubles
-        self.bounded_rows = q = 2 * n + self.laws
+        self.bounded_rows = q = 2 * n + self.laws + (self.options.grip is not None)
         self.row = shard.rows(9 * max(len(self.effectors.entry_dof), 1))
         self.error = shard.rows(e)
         self.bound = ActuatorBounds(shard, self.actuators, self.options.period)
@@ -181,6 +185,7 @@ class InverseProblem:
         self.predicted, self.displacement, self.command = wide(e), wide(n), wide(n)
         self.status = wide(1, wp.int32)
         softness = np.concatenate([np.zeros(n), np.full(q - n, SOFTNESS)])
+        softness[2 * n + self.laws :] = GRIP_SOFTNESS
         self.soft.assign(np.broadcast_to(softness, (shard.world_count, q)))
 
     def doubles(self, count: int, dtype: Any = wp.float64) -> wp.array:
