@@ -203,7 +203,6 @@ def main() -> None:
     parser.add_argument("--tests", type=int, default=UNSEEN, help="worlds that are not learned from, two at least")
     parser.add_argument("--looks", type=int, default=4, help="states of an action")
     parser.add_argument("--states", type=int, default=64)
-    parser.add_argument("--at-once", type=float, default=0.0, help="elements that join together, part of those chosen")
     parser.add_argument("--repeat", type=int, default=60, help="sub-steps of an action; fewer to try this script")
     parser.add_argument("--seed", type=int, default=11)
     parser.add_argument("--motion", type=Path, help="file that the motion is kept in, or read from where it is there")
@@ -255,7 +254,6 @@ def main() -> None:
             element_tolerance=tolerance or None,
             membrane_tolerance=tolerance or None,
             states=given.states,
-            at_once=given.at_once,
             seed=given.seed,
         )
         took = time.perf_counter() - begun

@@ -44,7 +44,6 @@ def sample_elements(
     *,
     size: float | None = None,
     most: int | None = None,
-    at_once: float = 0.0,
     told: Told | None = None,
 ) -> Sampling:
     """Few elements with weights from 0 on whose forces sum up to those of all.
@@ -57,9 +56,6 @@ def sample_elements(
         tolerance: Relative residual to end at, above 0 and below 1; usual are 0.01 to 0.1.
         size: What the tolerance refers to; None takes |G 1|.
         most: Elements to end at; None allows all.
-        at_once: Elements that may join together, as a part of those that have joined; one at a time at least. With 0.03
-            600 elements take a fifth, 1500 a ninth of the passes over G, which take the time on fine meshes; some more
-            elements are kept.
         told: Called with the elements that count and the residual, now and then.
 
     Raises:
@@ -84,21 +80,20 @@ def sample_elements(
     while np.linalg.norm(residual) > tolerance * size and len(active) < most:
         slope = single.T @ residual.astype(np.float32)
         slope[is_in | barred] = -np.inf
-        best = _steepest(slope, max(1, int(at_once * len(active))))
-        if not slope[best[0]] > 0.0:
+        best = int(np.argmax(slope))
+        if not slope[best] > 0.0:
             break
-        for element in best:
-            column = G[:, element].astype(np.float64)
-            along = columns.T @ column
-            gram = np.block([[gram, along[:, None]], [along[None, :], np.array([[column @ column]])]])
-            columns = np.column_stack([columns, column])
-            active.append(int(element))
+        column = G[:, best].astype(np.float64)
+        along = columns.T @ column
+        gram = np.block([[gram, along[:, None]], [along[None, :], np.array([[column @ column]])]])
+        columns = np.column_stack([columns, column])
+        active.append(best)
         is_in[best] = True
-        weight, kept = _least_squares(gram, columns, goal, np.append(weight, np.zeros(len(best))))
-        stayed = kept[len(kept) - len(best) :]
-        if stayed.any():
+        weight, kept = _least_squares(gram, columns, goal, np.append(weight, 0.0))
+        if not kept[-1]:
+            barred[best] = True  # rounding: it left as it came
+        elif barred.any():
             barred[:] = False
-        barred[best[~stayed]] = True  # rounding, or others that came with it: it left as it came
         if not kept.all():
             is_in[np.array(active)[~kept]] = False
             active = [a for a, keep in zip(active, kept, strict=True) if keep]
@@ -109,15 +104,6 @@ def sample_elements(
     result = np.zeros(elements)
     result[active] = weight
     return Sampling(result, float(np.linalg.norm(residual)) / size)
-
-
-def _steepest(slope: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    """Elements whose columns are most along the residual, the best first, others at least half as much."""
-    best = np.array([np.argmax(slope)])
-    if count > 1:
-        order = np.argsort(-slope, kind="stable")[:count]
-        best = np.append(best, order[(order != best[0]) & (slope[order] > 0.5 * slope[best[0]])])
-    return best
 
 
 def _least_squares(

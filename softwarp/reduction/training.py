@@ -49,7 +49,6 @@ def train(
     element_tolerance: float | None = 0.03,
     membrane_tolerance: float | None = 0.03,
     states: int = 96,
-    at_once: float = 0.0,
     still: tuple[str, ...] = (),
     seed: int = 0,
 ) -> Reduction:
@@ -72,7 +71,6 @@ def train(
         element_tolerance: Error of the tets' forces, as a part of the displacements that they go with; None keeps all.
         membrane_tolerance: Likewise of the membranes' triangles.
         states: States that elements are chosen by, drawn from the motion.
-        at_once: Elements that may join together, as of ``sample_elements``; more than 0 for fine meshes.
         still: Names of actuators that are not meant to move.
         seed: Of the draws.
 
@@ -89,7 +87,6 @@ def train(
         )
     checks.count(states, "states")
     checks.count(contact_modes, "contact_modes", low=0)
-    checks.number(at_once, "at_once", low=0.0, high=1.0)
     seed, mirrored = checks.seed(seed), checks.flag(mirrored, "mirrored")
     _refuse_still(sim, number, motion, still)
     nodes = slice(int(model.body_node_start[number]), int(model.body_node_start[number + 1]))
@@ -131,10 +128,8 @@ def train(
     with _kept(sim):
         forces = _Forces(elements_of(sim, number, nodes), basis)
         tets, thin = forces.contributions(_states(forces, _amplitudes(basis, mass, chosen), seed))
-        sampled = {"tets": _sample(tets, element_tolerance, at_once, "tets")}
-        sampled |= {
-            name: _sample(part, membrane_tolerance, at_once, f"membrane {name!r}") for name, part in thin.items()
-        }
+        sampled = {"tets": _sample(tets, element_tolerance, "tets")}
+        sampled |= {name: _sample(part, membrane_tolerance, f"membrane {name!r}") for name, part in thin.items()}
         unseen_residuals = _unseen(forces, sampled, _amplitudes(basis, mass, away[:states]))
     report: dict[str, Any] = {
         "snapshots": len(motion),
@@ -406,7 +401,7 @@ class _Mixing:
                 whole[target] += factor * row
 
 
-def _sample(contributions: FloatArray, tolerance: float | None, at_once: float, what: str) -> Sampling:
+def _sample(contributions: FloatArray, tolerance: float | None, what: str) -> Sampling:
     """Elements that count, and how near their forces come."""
     if tolerance is None:
         return Sampling(np.ones(contributions.shape[1]), 0.0)
@@ -414,7 +409,7 @@ def _sample(contributions: FloatArray, tolerance: float | None, at_once: float, 
     def told(count: int, residual: float) -> None:
         notices.progress(f"choosing {what}", f"{count} of {contributions.shape[1]}, residual {residual:.3g}")
 
-    found = sample_elements(contributions, tolerance, size=1.0, at_once=at_once, told=told)
+    found = sample_elements(contributions, tolerance, size=1.0, told=told)
     notices.progress_ends()
     if found.count == 0:
         raise ValueError(f"{what}: a tolerance of {tolerance:g} keeps no element; choose a smaller one, such as 0.03")

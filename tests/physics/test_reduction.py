@@ -183,19 +183,6 @@ def test_sampling_finds_few_elements():
         reduction.sample_elements(G, float("nan"))
 
 
-def test_elements_may_join_together():
-    """Some at a time: within the tolerance all the same, with few more; none asked for is one at a time, to the bit."""
-    draws = np.random.default_rng(1)
-    G = np.abs(draws.normal(size=(120, 60))) @ np.abs(draws.normal(size=(60, 900))) + draws.normal(size=(120, 900))
-    whole = G.sum(axis=1)
-    alone, together = (reduction.sample_elements(G, 1e-3, at_once=share) for share in (0.0, 0.05))
-    assert (together.weight >= 0.0).all()
-    assert np.linalg.norm(G @ together.weight - whole) <= 1e-3 * np.linalg.norm(whole)
-    assert alone.count > 20
-    assert together.count <= 1.25 * alone.count
-    np.testing.assert_array_equal(reduction.sample_elements(G, 1e-3).weight, alone.weight)
-
-
 @pytest.fixture(scope="module")
 def trained():
     """Motion of the held slab, and what reduces it: with all elements, and with few."""
