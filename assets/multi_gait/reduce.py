@@ -7,9 +7,10 @@
         --element-tolerance 0.015 --without-all                     # a quarter of an hour on a CPU: two actions long
 
 Worlds fill or empty a group of chambers drawn at random, one action after the other; states of all of them are the
-motion that modes and elements come from. Two more worlds are not learned from: one walks the hand-written gait, one has
-commands of its own. The reduced robot then does the same beside them. With ``--turning`` all five chambers are filled
-on their own, and the first of the two worlds turns by legs across from each other.
+motion that modes and elements come from. Two more worlds or, with ``--tests``, as many as wanted are not learned from:
+one walks the hand-written gait, others have commands of their own. The reduced robot then does the same beside them.
+With ``--turning`` all five chambers are filled on their own, and the first of the worlds that test turns by legs across
+from each other.
 """
 
 import argparse
@@ -32,7 +33,7 @@ from softwarp.reduction.basis import NORMS
 from softwarp.reduction.motion import Watch
 
 EXACT = {"coarse": 8, "fine": 1}  # worlds in float64 that forces of elements come from: a fine one takes 1 GB
-UNSEEN = 2  # worlds
+UNSEEN = 2  # worlds that test at least
 PAIRS = ((4, 1), (2, 3))  # chambers of legs across from each other
 KEPT = 3e-5  # part of the motion that a file of it may leave out
 
@@ -85,6 +86,13 @@ def apart(worlds: int, actions: int, seed: int) -> torch.Tensor:
     return torch.stack(told)
 
 
+def with_tests(told: torch.Tensor, tests: int, seed: int, *, turning: bool) -> torch.Tensor:
+    """Further worlds that test, behind the first ``UNSEEN``: their actions hang on the seed alone."""
+    draw, actions = apart if turning else commands, len(told)
+    more = [draw(UNSEEN, actions, seed + number)[:, 1:] for number in range(1, tests - UNSEEN + 1)]
+    return torch.cat([told[:, :UNSEEN], *more, told[:, UNSEEN:]], dim=1)
+
+
 @torch.no_grad()
 def run(env: Any, told: torch.Tensor, worlds: slice, looks: int, watch: Watch | None = None) -> torch.Tensor:
     """Carry out actions, (action, world, ...); places of all nodes of some worlds, (look, world, node, 3)."""
@@ -103,11 +111,11 @@ def run(env: Any, told: torch.Tensor, worlds: slice, looks: int, watch: Watch | 
     return torch.stack(kept)
 
 
-def only_seen(motion: reduction.Motion, worlds: int) -> reduction.Motion:
+def only_seen(motion: reduction.Motion, worlds: int, tests: int) -> reduction.Motion:
     """Without the worlds that are to test; those that failed are not in it, and there must be none."""
     if len(motion) % worlds:
         raise RuntimeError("a world failed while motion was recorded")
-    seen = (np.arange(len(motion)) % worlds) >= UNSEEN
+    seen = (np.arange(len(motion)) % worlds) >= tests
     touch = None if motion.touch is None else motion.touch[seen]
     return reduction.Motion(motion.positions[seen], motion.travel, touch)
 
@@ -153,8 +161,9 @@ def told_beside(full: torch.Tensor, small: torch.Tensor, cycle: int, ends: Seque
         cycle: Looks.
         ends: Nodes at the rear and the front end of the body's axis.
     """
-    lines = []
-    for world, name in enumerate(("hand-written gait", "random commands")):
+    lines, parts = [], []
+    for world in range(full.shape[1]):
+        name = "random commands" if world else "hand-written gait"
         a, b = full[:cycle, world], small[:cycle, world]
         means = [x.mean(dim=1) for x in (a, b)]
         apart = (means[0] - means[1]).norm(dim=-1)
@@ -163,13 +172,18 @@ def told_beside(full: torch.Tensor, small: torch.Tensor, cycle: int, ends: Seque
         won = [float(m[-1, 0] - full[0, world].mean(dim=0)[0]) for m in means]
         axes = [x[-1, ends[1]] - x[-1, ends[0]] for x in (a, b)]
         turned = [math.degrees(math.atan2(float(axis[1]), float(axis[0]))) for axis in axes]
+        parts.append(float(100 * apart.mean() / way))
         lines.append(
             f"{name}, two cycles: mean place {1e3 * apart.mean():.3f} mm apart (end {1e3 * apart[-1]:.3f}) on a way of "
-            f"{1e3 * way:.2f} mm, {100 * apart.mean() / way:.2f} %; nodes {1e3 * nodes.mean():.3f} mm apart; at the "
+            f"{1e3 * way:.2f} mm, {parts[-1]:.2f} %; nodes {1e3 * nodes.mean():.3f} mm apart; at the "
             f"end x is {1e3 * won[0]:.3f} mm in full, {1e3 * won[1]:.3f} reduced, the heading {turned[0]:.2f} and "
             f"{turned[1]:.2f} degrees"
         )
-    return lines
+    drawn = parts[1:]
+    return [
+        *lines,
+        f"random commands of {len(drawn)} worlds: {np.mean(drawn):.2f} % in the mean, {max(drawn):.2f} at most",
+    ]
 
 
 def main() -> None:
@@ -186,6 +200,7 @@ def main() -> None:
     parser.add_argument("--norm", nargs="+", choices=list(NORMS), default=["step"], help="as many as of modes, or one")
     parser.add_argument("--element-tolerance", type=float, nargs="+", default=[0.01])
     parser.add_argument("--told", nargs="+", metavar="DIGITS", help="actions of worlds to learn from, not drawn ones")
+    parser.add_argument("--tests", type=int, default=UNSEEN, help="worlds that are not learned from, two at least")
     parser.add_argument("--looks", type=int, default=4, help="states of an action")
     parser.add_argument("--states", type=int, default=64)
     parser.add_argument("--repeat", type=int, default=60, help="sub-steps of an action; fewer to try this script")
@@ -199,21 +214,26 @@ def main() -> None:
     options["mesh"] = given.mesh
     if given.turning:
         options |= {"chambers": "each", "action_kind": "continuous"}
-    worlds = UNSEEN + (len(given.told) if given.told else given.worlds)
+    if given.tests < UNSEEN:
+        parser.error(f"--tests: at least {UNSEEN}, got {given.tests}")
     if given.told:
         told = listed(given.told, given.seed)
     else:
-        told = (apart if given.turning else commands)(worlds, given.actions, given.seed)
+        told = (apart if given.turning else commands)(UNSEEN + given.worlds, given.actions, given.seed)
+    told = with_tests(told, given.tests, given.seed, turning=given.turning)
+    worlds, testing = told.shape[1], slice(0, given.tests)
     double = {"precision": "float64", "settle": False}  # elements are looked at, no motion
     exact = registry.make("MultiGaitFull", num_worlds=EXACT[given.mesh], seed=given.seed, **double, **options)
     rest = exact.sim.model.node_rest
     if given.motion is not None and given.motion.exists():
         full, motion = kept_motion(given.motion, rest)
+        if full.shape[1] != given.tests:
+            parser.error(f"--tests: {given.motion} has {full.shape[1]} worlds that test, got {given.tests}")
     else:
         env = registry.make("MultiGaitFull", num_worlds=worlds, device=given.device, seed=given.seed, **options)
         watch = Watch(env.sim)
-        full = run(env, told, slice(0, UNSEEN), given.looks, watch)
-        motion = only_seen(watch.finish(), worlds)
+        full = run(env, told, testing, given.looks, watch)
+        motion = only_seen(watch.finish(), worlds, given.tests)
         motion = motion if given.turning else motion.symmetric(rest)
         if given.motion is not None:
             keep_motion(given.motion, full, motion, rest)
@@ -248,13 +268,13 @@ def main() -> None:
                 kept.save(file)
                 pair = registry.make(
                     "MultiGaitFull",
-                    num_worlds=UNSEEN,
+                    num_worlds=given.tests,
                     device=given.device,
                     seed=given.seed,
                     reduced=str(file),
                     **options,
                 )
-                other = run(pair, told[: min(2 * len(GAIT), len(told)), :UNSEEN], slice(0, UNSEEN), given.looks)
+                other = run(pair, told[: min(2 * len(GAIT), len(told)), testing], testing, given.looks)
             ends = [exact.scene.tracked[k] for k in AXIS_ENDS]
             for line in told_beside(full, other, min(cycle, len(other)), ends):
                 print(f"  {name}: {line}", flush=True)
