@@ -60,7 +60,7 @@ class ElementTensors:
         body, volume = model.tet_body.numpy(), wp.to_torch(model.tet_volume)
         if q is not None:
             body = np.concatenate([body, q.layout.body])
-            of_points = wp.to_torch(q.point_volume).reshape(-1, quadratic.POINTS)
+            of_points = 0.25 * wp.to_torch(q.point_size).reshape(-1, quadratic.POINTS)
             whole = of_points.sum(dim=1)
             self._share = (of_points / whole[:, None])[None, :, :, None]
             volume = torch.cat([volume, whole])
