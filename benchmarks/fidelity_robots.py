@@ -27,6 +27,7 @@ from softwarp.envs.scenes.diamond import EFFECTOR, build_diamond_scene, diamond_
 from softwarp.envs.scenes.gripper import build_gripper_scene
 from softwarp.envs.scenes.tripod import build_tripod_scene, tripod_mesh
 from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
+from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.finger_geometry import FLANGE
 from softwarp.meshing.trunk_geometry import LENGTH
 
@@ -70,6 +71,7 @@ def weighed(
     held: Callable[[Floats], NDArray[np.bool_]],
     point: Sequence[float] | Floats,
     gravity: Sequence[Sequence[float]],
+    stiffness: Floats | None = None,
 ) -> tuple[Floats, Floats]:
     """Where a point of a solid rests under gravity [m/s^2], in float64, (case, 3), and where it is without.
 
@@ -80,6 +82,7 @@ def weighed(
         held: Which of places (node, 3) are held.
         point: What is looked at [m].
         gravity: One a case.
+        stiffness: Factors of the modulus.
     """
     builder = softwarp.ModelBuilder()
     body = builder.add_tets(
@@ -88,6 +91,7 @@ def weighed(
         element=config.element,
         total_mass=mass,
         lumping=cast("Any", getattr(config, "lumping", "volume") if config.element == "p1" else "volume"),
+        stiffness=stiffness,
     )
     builder.fix(body, nodes=np.flatnonzero(held(builder.bodies[body].mesh.nodes)))
     builder.add_marker(body, tuple(point), tolerance=0.006)
@@ -114,7 +118,8 @@ def _diamond(options: Options) -> tuple[Floats, Floats]:
     def held(x: Floats) -> NDArray[np.bool_]:
         return (np.abs(x[:, 0]) <= limit) & (np.abs(x[:, 1]) <= limit) & (x[:, 2] <= 0.01)
 
-    return weighed(diamond_mesh(config), config, config.total_mass, held, EFFECTOR, DIAMOND_LOADS)
+    stiffness = coarse_stiffness() if config.coarsened else None
+    return weighed(diamond_mesh(config), config, config.total_mass, held, EFFECTOR, DIAMOND_LOADS, stiffness)
 
 
 def _tripod(options: Options) -> tuple[Floats, Floats]:
@@ -180,6 +185,7 @@ ROBOTS = {
             "default": {},
             "fine": {"mesh": "fine", **WARPED, "lumping": "volume"},
             "p2": {"mesh": "coarse", **SOLID},
+            "accurate": {"fidelity": "accurate"},
         },
         (0.0, 0.0, 0.0),
         _pull,

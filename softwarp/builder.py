@@ -75,6 +75,7 @@ class ModelBuilder(Tendons, Telescopes):
         lumping: Literal["volume", "uniform"] = "volume",
         rayleigh: tuple[float, float] = (0.0, 0.0),
         relaxation: tuple[float, float] = (0.0, 0.0),
+        stiffness: ArrayLike | None = None,
         contact_surface: Any = None,
         name: str | None = None,
     ) -> SoftBody:
@@ -94,6 +95,9 @@ class ModelBuilder(Tendons, Telescopes):
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
             relaxation: Stress that decays: the stiffness of a Maxwell branch per that of the law, and its time [s].
                 At rest the body is as stiff as its law, in quick motion by the ratio stiffer, and damped in between.
+            stiffness: Factors of the modulus, positive: one an element, (m,), or one a Gauss point of quadratic ones,
+                (m, 4). They stand for several materials, or make up for a coarse mesh; stresses that are told are the
+                law's, without them.
             contact_surface: What touches, coarser or finer than the mesh: a ``SurfaceMesh``, ``trimesh.Trimesh`` or
                 (points, triangles) beside its boundary, or points (k, 3) alone; None takes the boundary itself.
             name: For messages and exports.
@@ -107,7 +111,7 @@ class ModelBuilder(Tendons, Telescopes):
         """
         options: dict[str, Any] = {"material": material, "element": element, "density": density, "name": name}
         options |= {"total_mass": total_mass, "lumping": lumping, "rayleigh": rayleigh}
-        options |= {"relaxation": relaxation, "contact_surface": contact_surface}
+        options |= {"relaxation": relaxation, "stiffness": stiffness, "contact_surface": contact_surface}
         return bodies.add_tets(self.scene, nodes, tets, **options)
 
     def reduce(self, body: SoftBody | int, reduction: Reduced, *, frame: str | None = None) -> None:

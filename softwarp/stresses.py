@@ -57,10 +57,11 @@ class ElementTensors:
         points = 0 if q is None else quadratic.POINTS * q.count
         self._points = [allocate(worlds, 9 * points, real, device) for _ in range(2)]
         self._corner = allocate(worlds, 12 * points, real, device)
-        body, volume = model.tet_body.numpy(), wp.to_torch(model.tet_volume)
+        body = model.tet_body.numpy()
+        volume = wp.to_torch(model.tet_size if model.reduction is None else model.tet_volume)
         if q is not None:
             body = np.concatenate([body, q.layout.body])
-            of_points = wp.to_torch(q.point_volume).reshape(-1, quadratic.POINTS)
+            of_points = 0.25 * wp.to_torch(q.point_size).reshape(-1, quadratic.POINTS)
             whole = of_points.sum(dim=1)
             self._share = (of_points / whole[:, None])[None, :, :, None]
             volume = torch.cat([volume, whole])

@@ -39,6 +39,10 @@ SECTIONS = (
     (HUB_HALF, 0.1084, HUB_HALF, 0.1173, HUB_HALF),
 )
 
+# Factors of the modulus with which quadratic elements of the coarse mesh move as converged ones do: rows of SECTIONS
+# and factors there, linear in between, for nu = 0.45. assets/diamond/coarsen.py fits them.
+COARSE_STIFFNESS = ((2.0, 6.0, 8.0, 12.0), (0.868, 1.090, 0.621, 0.549))
+
 # Cells through the thickness of a leg, across it, and between two rows of SECTIONS.
 DETAILS = {"coarse": (1, 2, 1), "medium": (2, 4, 2), "fine": (3, 6, 3)}
 
@@ -83,6 +87,24 @@ def diamond(resolution: str = "medium") -> TetMesh:
             tets.append(cut_prisms(side, side_rank, np.concatenate([low, high])))
     every = np.concatenate(nodes)
     return TetMesh(every, orient(every, np.concatenate(tets)), f"diamond {resolution}")
+
+
+def diamond_places(resolution: str = "medium") -> FloatArray:
+    """Where the tetrahedra of ``diamond`` lie along a leg, in rows of ``SECTIONS``, shape (tet,).
+
+    They are the middles of the intervals that tetrahedra lie in; those of the two blocks are where legs begin and end.
+    """
+    check_name(resolution, DETAILS, "diamond")
+    layers, across, parts = DETAILS[resolution]
+    rows = len(SECTIONS) - 1
+    block, slab = 6 * layers * across**2, 6 * layers * across  # tets: two triangles a cell, three a prism
+    leg = np.repeat((np.arange(parts * rows) + 0.5) / parts, slab)
+    return np.concatenate([np.repeat([0.0, float(rows)], block), *[leg] * 4])
+
+
+def coarse_stiffness() -> FloatArray:
+    """Factors of the modulus for quadratic elements of ``diamond("coarse")``, shape (tet,): ``COARSE_STIFFNESS``."""
+    return np.interp(diamond_places("coarse"), *COARSE_STIFFNESS)
 
 
 def _refined(parts: int) -> FloatArray:

@@ -82,7 +82,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     tet_node: wp.array = shared("tet", doc="corner nodes, (tet, 4)")
     tet_body: wp.array = shared("tet", doc="body of the tet")
     tet_gradient: wp.array = shared("tet", unit="1/m", doc="rest gradients of shape functions 1 to 3, (tet, 9)")
-    tet_volume: wp.array = shared("tet", unit="m^3", doc="rest volume, times the weight of a tet of a reduced body")
+    tet_volume: wp.array = shared("tet", unit="m^3", doc="rest volume, times the weight or factor of the tet")
     tet_size: wp.array = shared("tet", unit="m^3", doc="rest volume")
     tet_frame: wp.array = shared("tet", doc="rest frame of the edges by rows, for the large rotation, (tet, 9)")
     body_law_start: wp.array = shared("body", doc="first of the body's rows in law_parameter")

@@ -24,6 +24,7 @@ class QuadraticLayout:
     laws: NDArray[Any]  # kernel law of every element
     products: FloatArray  # (element, 10, 10) integrals of N_a N_b [m^3]
     lumped: FloatArray  # (element, 10) positive nodal volumes [m^3]
+    stiffness: FloatArray  # (element, 4) factors of the modulus at Gauss points
 
 
 @dataclass
@@ -39,7 +40,7 @@ class QuadraticModel:
     point_tet: wp.array = shared("Gauss point", doc="its corners: 4 point + k, (point, 4)")
     point_body: wp.array = shared("Gauss point", doc="body of the element")
     point_gradient: wp.array = shared("Gauss point", unit="1/m", doc="rest gradients of L_1 to L_3, (point, 9)")
-    point_volume: wp.array = shared("Gauss point", unit="m^3", doc="share of the rest volume")
+    point_volume: wp.array = shared("Gauss point", unit="m^3", doc="share of the rest volume, times its factor")
     point_size: wp.array = shared("Gauss point", unit="m^3", doc="rest volume of its linear tet")
     point_frame: wp.array = shared("Gauss point", doc="rest frame for the large rotation, by rows, (point, 9)")
     large_entry_start: wp.array = shared("block", doc="ranges in large_entry, (block + 1,)")

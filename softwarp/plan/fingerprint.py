@@ -108,6 +108,9 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
     add(model, SOFT)
     if model.quadratic is not None:
         add(model.quadratic, {"nodes": INT})
+    for body in scene.bodies:
+        if body.stiffness is not None:
+            digest.update(body.stiffness.tobytes())
     if model.cable_elastic.any():
         digest.update(model.cable_elastic.tobytes())
     if model.relaxes:

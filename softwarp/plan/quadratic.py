@@ -25,9 +25,12 @@ def quadratic_layout(scene: Scene, node_start: IntArray) -> QuadraticLayout:
     """Number the elements body after body."""
     found = [(i, b.mesh.nodes, b.elements) for i, b in enumerate(scene.bodies) if b.elements is not None]
     nodes, products = [np.empty((0, NODES), dtype=np.int32)], [np.empty((0, NODES, NODES))]
+    stiffness = [np.empty((0, POINTS))]
     for i, x, elements in found:
         nodes.append(elements + node_start[i])
         products.append(quadratic.shape_products(x, elements))
+        given = scene.bodies[i].stiffness
+        stiffness.append(np.ones((len(elements), POINTS)) if given is None else given)
     body = np.repeat([i for i, _, _ in found], [len(part) for part in nodes[1:]]).astype(np.int32)
     laws = np.array([spec.material.kernel_law for spec in scene.bodies], dtype=object)
     together = np.concatenate(products)
@@ -37,6 +40,7 @@ def quadratic_layout(scene: Scene, node_start: IntArray) -> QuadraticLayout:
         laws=laws[body] if len(body) else np.empty(0, dtype=object),
         products=together,
         lumped=quadratic.lumped(together),
+        stiffness=np.concatenate(stiffness),
     )
 
 
@@ -70,7 +74,7 @@ def quadratic_model(layout: QuadraticLayout, nodes: FloatArray, found: Structure
         point_tet=tets,
         point_body=np.repeat(layout.body, POINTS),
         point_gradient=gradient,
-        point_volume=volume / POINTS,
+        point_volume=layout.stiffness.ravel() * volume / POINTS,
         point_size=volume,
         point_frame=frame,
         **vars(entry_lists(found)),

@@ -40,7 +40,7 @@ class SoftLayout:
     locked: NDArray[np.bool_]  # (node, 3)
     laws: NDArray[Any]  # kernel law of every tet
     gradient: FloatArray
-    volume: FloatArray  # with weights of reduced bodies
+    volume: FloatArray  # with weights of reduced bodies, and factors of the modulus
     size: FloatArray  # without
     frame: FloatArray
     node_volume: FloatArray
@@ -62,7 +62,7 @@ def soft_layout(scene: Scene) -> SoftLayout:
     gradient, volume, frame = rest_geometry(nodes, tets)
     quadratic = quadratic_layout(scene, node_start)
     volumes = [_lumped_volume(b, volume[tet_body == i]) for i, b in enumerate(bodies)]
-    given = [np.ones(len(b.tets)) if b.reduction is None else b.reduction.tet_weight for _, b in own]
+    given = [_weights(b) for _, b in own]
     weight = stacked(given, (0,), np.float64)
     counts = weight > 0.0
     end = (0, len(guides))
@@ -88,6 +88,13 @@ def soft_layout(scene: Scene) -> SoftLayout:
         quadratic=quadratic,
         reduced=np.pad(np.repeat([b.reduction is not None for b in bodies], np.diff(node_start)), end).astype(bool),
     )
+
+
+def _weights(body: BodySpec) -> FloatArray:
+    """How often elements count, (tet,)."""
+    if body.reduction is not None:
+        return body.reduction.tet_weight
+    return np.ones(len(body.tets)) if body.stiffness is None else body.stiffness
 
 
 def _lumped_volume(body: BodySpec, volume: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from softwarp import checks, meshing
 from softwarp.meshing import MeshError
+from softwarp.meshing.quadratic import POINTS
 from softwarp.model.handles import Rod, SoftBody
 from softwarp.scene.checks import Box, corners, factors, node_indices, vector
 from softwarp.scene.materials import Material
@@ -33,6 +34,7 @@ def add_tets(
     lumping: Literal["volume", "uniform"],
     rayleigh: tuple[float, float],
     relaxation: tuple[float, float] = (0.0, 0.0),
+    stiffness: ArrayLike | None = None,
     name: str | None,
     contact_surface: Any = None,
 ) -> SoftBody:
@@ -69,6 +71,7 @@ def add_tets(
             locked=np.zeros((count, 3), dtype=bool),
             load=np.zeros((count, 3)),
             elements=None if quadratic is None else quadratic.elements,
+            stiffness=None if stiffness is None else _stiffness(stiffness, mesh, quadratic, label),
             contact_surface=None if contact_surface is None else _contact_surface(contact_surface, mesh, label),
         )
     )
@@ -83,6 +86,23 @@ def _relaxation(value: Any, label: str) -> tuple[float, float]:
             f"body {label!r}: relaxation must have both a ratio and a time [s] above 0, or none, got {value!r}"
         )
     return ratio, time
+
+
+def _stiffness(
+    value: ArrayLike, mesh: meshing.TetMesh, quadratic: meshing.QuadraticMesh | None, label: str
+) -> FloatArray:
+    """Factors of the modulus, (m,) of linear tets, (m, 4) of the Gauss points of quadratic ones."""
+    found = checks.as_array(value).astype(np.float64)
+    if quadratic is None:
+        shapes: list[tuple[int, ...]] = [(len(mesh.tets),)]
+    else:
+        shapes = [(len(quadratic.elements),), (len(quadratic.elements), POINTS)]
+    if found.shape not in shapes or not (np.isfinite(found) & (found > 0.0)).all():
+        told = " or ".join(map(str, shapes))
+        raise ValueError(
+            f"body {label!r}: stiffness must be positive and finite, of shape {told}, got shape {found.shape}"
+        )
+    return np.repeat(found[:, None], POINTS, axis=1) if quadratic is not None and found.ndim == 1 else found
 
 
 def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSurface:

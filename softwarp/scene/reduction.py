@@ -62,6 +62,8 @@ def reduce(scene: Scene, body: int, reduction: Reduced, frame: str | None = None
         raise ValueError(f"{label} is reduced already; reduce every body once")
     if spec.relaxation[0] > 0.0:
         raise ValueError(f"{label}: relaxation and reduce do not go together; leave one of them out")
+    if spec.stiffness is not None:
+        raise ValueError(f"{label}: stiffness and reduce do not go together; leave one of them out")
     made = "floating" if reduction.turns else "fixed"
     if frame is not None and checks.choice(frame, f"{label}: frame", FRAMES) != made:
         raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -25,14 +26,16 @@ from softwarp.envs.options import (
     check_options,
 )
 from softwarp.envs.options.cable_reach import CableReachConfig
+from softwarp.envs.options.fidelity import FidelityConfig
 
 CABLES = 4
 ROTATIONS = ("large", "polar", "warped")
+COARSENED_NU = 0.45  # that factors of moduli are fitted for
 BORNE = 1.6e-5  # m^2, tension of all cables over youngs: 2.88 N shorten them by 3 cm by default; 4 N never come to rest
 
 
 @dataclass(kw_only=True)
-class DiamondSceneConfig:
+class DiamondSceneConfig(FidelityConfig):
     """Options of the scene; the defaults are SofaGym's, with cables that only pull, as far as 25 mm."""
 
     mesh: str = "medium"  # "coarse", "medium", "fine", or a mesh file
@@ -41,6 +44,7 @@ class DiamondSceneConfig:
     nu: PoissonRatio = 0.45
     element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
+    coarsened: bool = False  # moduli along the legs with which the coarse mesh of "p2" moves as converged ones do
     total_mass: Mass = 0.5  # kg
     lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
     rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness
@@ -51,9 +55,22 @@ class DiamondSceneConfig:
     max_displacement: HighLimit = 0.025  # m, how far they may be shortened
     max_rate: Unlimited = 0.1  # m/s, change of a cable's length: 1 mm in 10 ms
 
+    ACCURATE: ClassVar[Mapping[str, Any]] = {
+        "mesh": "coarse",
+        "element": "p2",
+        "rotation": "warped",
+        "coarsened": True,
+    }
+
     def __post_init__(self) -> None:
         """Refuse impossible limits, and cables that crush the body whatever they are told."""
         check_options(self)
+        self.take_fidelity()
+        if self.coarsened and (self.mesh, self.element, self.nu) != ("coarse", "p2", COARSENED_NU):
+            raise ValueError(
+                f"{type(self).__name__}: coarsened moduli are for mesh='coarse', element='p2' and nu={COARSENED_NU:g}, "
+                f"got {self.mesh!r}, {self.element!r} and {self.nu!r}; leave coarsened and fidelity out"
+            )
         check_choice(self, "element", ("p1", "p2"))
         check_choice(self, "rotation", ROTATIONS)
         check_choice(self, "lumping", ("uniform", "volume"))

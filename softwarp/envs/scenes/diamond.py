@@ -20,6 +20,7 @@ from softwarp.builder import ModelBuilder
 from softwarp.envs.options.diamond import CABLES as CABLES
 from softwarp.envs.options.diamond import ROTATIONS as ROTATIONS
 from softwarp.envs.options.diamond import DiamondSceneConfig
+from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
@@ -52,6 +53,7 @@ def build_diamond_scene(config: DiamondSceneConfig, builder: ModelBuilder) -> Di
         total_mass=config.total_mass,
         lumping=cast('Literal["volume", "uniform"]', config.lumping if config.element == "p1" else "volume"),
         rayleigh=config.rayleigh,
+        stiffness=coarse_stiffness() if config.coarsened else None,
         name="diamond",
     )
     half = config.base_half + 1.0e-9

@@ -5,7 +5,7 @@ import pytest
 
 from softwarp import meshing
 from softwarp.meshing import MeshError
-from softwarp.meshing.diamond_geometry import HUB_HALF, SECTIONS, TOP_MIDDLE
+from softwarp.meshing.diamond_geometry import HUB_HALF, SECTIONS, TOP_MIDDLE, coarse_stiffness, diamond_places
 
 REFERENCE_VOLUME = 392_357e-9  # m^3, of the published mesh: 1628 nodes, 4147 tetrahedra
 RESOLUTIONS = ("coarse", "medium", "fine")
@@ -25,6 +25,23 @@ def test_counts_and_volume(resolution, nodes, tets):
     assert (len(mesh.nodes), len(mesh.tets)) == (nodes, tets)
     assert mesh.volume == pytest.approx(REFERENCE_VOLUME, rel=0.03)
     assert mesh.name == f"diamond {resolution}"
+
+
+def test_places_are_where_tets_lie(diamond):
+    """Those of the blocks at the ends of a leg, half of them at each; in between, heights of tets rise with places."""
+    resolution = diamond.name.split()[1]
+    place, rows = diamond_places(resolution), len(SECTIONS) - 1
+    height = diamond.nodes[diamond.tets].mean(axis=1)
+    assert (height[place == 0.0, 2] < 0.0).all() and (height[place == rows, 2] > 0.1).all()
+    axis = np.abs(height[:, :2]).max(axis=1)
+    table = np.array(SECTIONS)
+    low, high = np.floor(place).astype(int), np.minimum(np.floor(place).astype(int) + 1, rows)
+    ends = np.stack([table[low], table[high]])
+    is_leg = (place > 0.0) & (place < rows)
+    for values, columns in ((axis, [0, 2]), (height[:, 2], [1, 3])):
+        least, most = ends[..., columns].min(axis=(0, 2)), ends[..., columns].max(axis=(0, 2))
+        assert ((values >= least - 1e-9) & (values <= most + 1e-9))[is_leg].all()
+    assert coarse_stiffness().shape == (720,)
 
 
 def test_bounds_are_those_of_the_published_mesh(diamond):
