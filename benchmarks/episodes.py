@@ -45,6 +45,7 @@ def episode(name: str, worlds: int, device: str, stages: bool, options: dict[str
     env.step(policy(now))  # compiles
     now = env.reset()
     wall, contacts = [], []
+    met = now["success"] & False
     with torch.no_grad():
         for _ in range(LENGTH[name]):
             action = policy(now)
@@ -54,6 +55,7 @@ def episode(name: str, worlds: int, device: str, stages: bool, options: dict[str
             wp.synchronize_device(env.sim.device)
             wall.append(1e3 * (time.perf_counter() - begin) / env.action_repeat)
             contacts.append(env.sim.contact_count.float().mean().item())
+            met |= now["success"]
     record: dict[str, Any] = {
         "worlds": worlds,
         "nodes": env.sim.model.node_count,
@@ -64,6 +66,7 @@ def episode(name: str, worlds: int, device: str, stages: bool, options: dict[str
         "contacts_max": max(contacts),
         "overflow": int(env.sim.contact_overflow.max()),
         "success": float(now["success"].float().mean()),
+        "met": float(met.float().mean()),
         "ms_quarters": [float(part.mean()) for part in np.array_split(wall, QUARTERS)],
         "contacts_quarters": [float(part.mean()) for part in np.array_split(contacts, QUARTERS)],
     }
@@ -107,7 +110,8 @@ def show(record: dict[str, Any]) -> None:
     contacts = f"contacts {record['contacts']:.1f} (at most {record['contacts_max']:.0f})"
     print(
         f"{record['scene']:24s} {record['worlds']:5d} worlds, {record['nodes']} nodes: {times}, "
-        f"{record['world_steps_per_s']:.0f} world-steps/s, {contacts}, success {record['success']:.2f}",
+        f"{record['world_steps_per_s']:.0f} world-steps/s, {contacts}, success {record['success']:.2f}, "
+        f"in some action {record['met']:.2f}",
         flush=True,
     )
     quarters = zip(record["ms_quarters"], record["contacts_quarters"], strict=True)

@@ -21,9 +21,10 @@ from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.looks import chosen_looks
 from softwarp.solvers.options import Integrator, Options
 from softwarp.solvers.outputs import update_outputs
-from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
+from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, free_ranges, thread_count
 from softwarp.solvers.quasi_static import QuasiStatic
 from softwarp.solvers.relaxation import Relaxation
+from softwarp.solvers.repeats import repeats_steps
 from softwarp.solvers.second_order import stepper
 from softwarp.solvers.system import System
 from softwarp.statics import StaticResult as StaticResult
@@ -166,9 +167,10 @@ class Simulation(
         self.control = interop.Views("sim.control", control, interop.force_aliases(control, model))
         self.params = interop.Views("sim.params", interop.views(self._parameters, model))
         self._index = upload(model.symbolic, model.device)
-        self._bounds = world_ranges(self.variant, model, threads)
+        uneven = repeats_steps(model, self.options)
+        self._bounds, is_free = free_ranges(self.variant, model, threads, uneven)
+        self._shares_workspaces = not is_free
         self._turns = min(thread_count(threads), len(self._bounds))  # shards side by side; others wait for theirs
-        self._shares_workspaces = True
         self._systems = self._make_shards(model, self._state)
         self._contact_growth = checks.flag(contact_growth, "Simulation: contact_growth") and model.contact is not None
         self._workers = Workers(self._turns) if self._turns > 1 else None
@@ -212,8 +214,7 @@ class Simulation(
         """
         if not self._shares_workspaces:
             return [make(item) for item in items]
-        pools = [memory.Pool() for _ in range(self._turns)]
-        made = []
+        pools, made = [memory.Pool() for _ in range(self._turns)], []
         for number, item in enumerate(items):
             with memory.pooled(pools[number % self._turns]):
                 made.append(make(item))
@@ -357,9 +358,10 @@ class Simulation(
 
     def _replay(self, graphs: Sequence[Any], count: int) -> None:
         """Replay the graphs of the shards, on a CPU side by side and then that of the outputs, which is the last."""
+        queue = iter(range(len(self._systems)))  # of threads whose shards have memory of their own: who is free goes on
 
         def run(turn: int) -> None:
-            for shard in range(turn, len(self._systems), self._turns):
+            for shard in range(turn, len(self._systems), self._turns) if self._shares_workspaces else queue:
                 self._repeat(shard, partial(wp.capture_launch, graphs[shard]), count)
 
         try:
@@ -499,10 +501,7 @@ class Simulation(
         Raises:
             MemoryError: If they do not fit on the device.
         """
-
-        def make() -> list[System]:
-            return self._make_shards(self.model, state, control, parameters)
-
+        make = partial(self._make_shards, self.model, state, control, parameters)
         systems = with_room(make, "other worlds", self.model, interop.empty_cache)
         return [(slice(*bounds), system) for bounds, system in zip(self._bounds, systems, strict=True)]
 

@@ -12,7 +12,8 @@ from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.solvers.linear.cholesky import upload
 from softwarp.solvers.options import Options
-from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, thread_count, world_ranges
+from softwarp.solvers.partition import GPU_PATHS, SolverPath, choose_variant, free_ranges, thread_count
+from softwarp.solvers.repeats import repeats_steps
 from softwarp.solvers.second_order import stepper
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import workspace
@@ -93,8 +94,9 @@ def footprint(
             added, bill.total = bill.total - before, before
             return added
 
-        turns, fixed = thread_count(threads), 0
-        sizes = [end - begin for begin, end in world_ranges(variant, model, threads)]
+        ranges, is_free = free_ranges(variant, model, threads, repeats_steps(model, options))
+        sizes, fixed = [end - begin for begin, end in ranges], 0
+        turns = len(sizes) if is_free else thread_count(threads)
         first, later = Counter(sizes[:turns]), Counter(sizes[turns:])
         for worlds in first | later:
             pool = memory.Pool()

@@ -17,6 +17,7 @@ from softwarp.solvers.options import SolverPath as SolverPath
 GPU_PATHS = ("panels", "levels")
 MOST_THREADS = 4096
 LANES_FROM = 4  # worlds from which eight SIMD lanes beat one world after the other; benchmarks/trunk.py
+FREE_SHARDS, FREE_WORLDS = 8, 4  # for a thread at most, and in each at least, where threads take what is left
 SHARD_BYTES = 2.0e6  # of factors, held by the worlds that a CPU thread takes through a step together: its cache
 
 
@@ -62,7 +63,25 @@ def world_ranges(chosen: Variant, model: Model, threads: int | None) -> list[tup
     packs = -(-worlds // unit)
     factors = 9.0 * (8 if model.precision == "float64" else 4) * model.symbolic.block_count * unit
     together = max(1, int(SHARD_BYTES / max(factors, 1.0)))
-    count *= -(-packs // (count * together))
+    return _cut(worlds, unit, count * -(-packs // (count * together)))
+
+
+def free_ranges(chosen: Variant, model: Model, threads: int | None, uneven: bool) -> tuple[list[tuple[int, int]], bool]:
+    """Worlds that step as one, and whether threads take the next of them as soon as they are free.
+
+    That is so where steps are ``uneven``, as some worlds take much longer than others, and a thread would have one
+    shard: there are smaller ones then, each with memory of its own. With more of them, waits of threads even out.
+    """
+    ranges, count = world_ranges(chosen, model, threads), thread_count(threads)
+    if chosen.world_fastest or not uneven or not 1 < len(ranges) <= count:
+        return ranges, False
+    unit = LANE_COUNT if chosen.lanes > 1 else 1
+    finer = min(model.num_worlds // max(unit, FREE_WORLDS), FREE_SHARDS * count)
+    return (_cut(model.num_worlds, unit, finer), True) if finer > len(ranges) else (ranges, False)
+
+
+def _cut(worlds: int, unit: int, count: int) -> list[tuple[int, int]]:
+    packs = -(-worlds // unit)
     sizes = [part.size for part in np.array_split(np.arange(packs), min(count, packs))]
     cuts = np.cumsum([0, *sizes]) * unit
     return [(int(a), int(min(b, worlds))) for a, b in pairwise(cuts)]

@@ -293,6 +293,20 @@ def test_helix_without_load() -> None:
     assert float(torch.linalg.vector_norm(sim.rod_x[0, -1] - sim.rod_x[0, 0])) == pytest.approx(chord, rel=1e-6)
 
 
+def test_curls_that_segments_are_too_long_for() -> None:
+    """Segments of 10 mm bend by 2 rad at rest for a radius of 5 mm, as it is, and by 2.5 rad for one of 2 mm, not by 5.
+
+    Such a turn would be one of 1.3 rad to the other side; where a curl comes out of a tube it would flip there.
+    """
+    for curvature, turn in ((200.0, 2.0), (500.0, 2.5)):
+        tube = Tube([TubeSection(0.1, (curvature, 0.0, 0.0))], radius=1e-4, youngs=1e9)
+        builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.add_telescope([tube], segments=4, lengths=(0.04,), windup=False)
+        law = sw.Simulation(builder.finalize(1, precision="float64"), dt=0.01).segment_law[0]
+        np.testing.assert_allclose(law[:, 0] * law[:, 10], turn, rtol=1e-12)
+        np.testing.assert_allclose(law[:, 7:10], [[0.0, 0.0, 1.0]] * 4, atol=1e-12)
+
+
 def test_a_world_of_many_is_that_world_alone() -> None:
     """Bit for bit on one path; a command that is no number stops its own world only, and it goes on afterwards."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))

@@ -1,11 +1,16 @@
 """How far a line may swing in one linearised step. Theory: docs/theory/telescope.md, "Swings"."""
 
+from math import cos
 from types import SimpleNamespace
 
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.algebra.single import functions
 from softwarp.kernels.frames.tube_section import PLAN_ROWS
+
+MOST_TURN = 2.8  # rad, of a segment's ends against each other: beyond pi its strain is that of the other way round
+CHANGE = 1.0  # rad, up to which a step changes that without a closer look, where MOST_TURN leaves as much
 
 
 @single_worlds
@@ -14,6 +19,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     world_fastest = variant.world_fastest
     module = variant.module("restraint")
+    f = functions(variant)
+    vec3, quat, vector_at, quat_at, put = f.vec3, f.quat, f.vector_at, f.quat_at, f.put
+    exponential, logarithm = f.exponential, f.logarithm
 
     @wp.func
     def way_between(u: wp.array3d(dtype=real), a: int, b: int, scale: real, pack: int, lane: int):
@@ -145,7 +153,56 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if dof_free[dof, c] != real(0.0):
                         u_out[pack, 3 * dof + c, lane] = share * u_out[pack, 3 * dof + c, lane]
 
+    @wp.func
+    def turned_back(rest: quat, most: real):
+        """A turn whose scalar part is below ``most`` about the same axis, but by less."""
+        v = vec3(rest[0], rest[1], rest[2])
+        v = v * (wp.sqrt(wp.max(real(1.0) - most * most, real(0.0))) / wp.length(v))
+        return quat(v[0], v[1], v[2], most)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def hold_turns(
+        h: real,
+        # Model
+        pieces: wp.array(dtype=wp.int32),
+        base_frame: wp.array(dtype=wp.int32),
+        frame_dof: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        pose_in: wp.array3d(dtype=real),
+        # Workspace out
+        u_out: wp.array3d(dtype=real),
+    ):
+        """No segment's ends turn against each other by more than ``MOST_TURN``, or more than they do already.
+
+        From the base on, the far end is turned back to that, about the axis that it was to turn about.
+        """
+        pack, lane = wp.tid()
+        for item in range(pieces.shape[0]):
+            for place in range(pieces[item]):
+                frame = base_frame[item] + place
+                a = frame_dof[2 * frame + 1]
+                b = frame_dof[2 * frame + 3]
+                p = quat_at(pose_in, pack, lane, 7 * frame + 3)
+                q = quat_at(pose_in, pack, lane, 7 * frame + 10)
+                now = wp.abs(wp.dot(p, q))
+                turn = way_between(u_out, a, b, h, pack, lane)
+                if now < real(wp.static(cos(0.5 * (MOST_TURN - CHANGE)))) or turn > real(CHANGE * CHANGE):
+                    start = wp.quat_inverse(p) * q
+                    if start[3] < real(0.0):
+                        start = -start
+                    p = exponential(h * vector_at(u_out, pack, lane, 3 * a)) * p
+                    end = wp.quat_inverse(p) * (exponential(h * vector_at(u_out, pack, lane, 3 * b)) * q)
+                    if wp.dot(start, end) < real(0.0):
+                        end = -end
+                    most = wp.min(real(wp.static(cos(0.5 * MOST_TURN))), start[3])
+                    free = dof_free[b, 0] * dof_free[b, 1] * dof_free[b, 2]
+                    if end[3] < most and free != real(0.0):
+                        back = p * turned_back(end, most) * wp.quat_inverse(q)
+                        put(u_out, pack, lane, 3 * b, logarithm(back) / h)
+
     return SimpleNamespace(
+        hold_turns=hold_turns,
         swing_of_segment=swing_of_segment,
         share_of_segments=share_of_segments,
         share_of_way=share_of_way,

@@ -16,6 +16,8 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 PLAN_ROWS = 7  # of a telescope: old and new length of its line, way and old and new carrier, whether it moves, base
 LAW_ROWS = 13  # of a segment: length, C, D, rest strain
+# rad, of a segment at rest: what curls more needs shorter ones, and beyond pi its ends lie either way round
+MOST_CURL = 2.5
 GRAIN = 2.0e-4  # of a segment: parts shorter than that, which float32 may not resolve, are left out
 RIGID = 1.0e-4  # of a segment: shortest length behind the port that counts as one that twists
 SMOOTHING = 0.1  # part of the change of a moment that one step takes into account
@@ -262,7 +264,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 s + real(0.5) * part,
             )
             soft += vec4(part / mean.bending, part / mean.torsion, part / mean.shear, part / mean.axial)
-            turn = mean.k * part
+            turn = mean.k * (
+                part * wp.min(real(1.0), real(MOST_CURL) / wp.max(wp.length(mean.k) * piece, real(1.0e-6)))
+            )
             x += wp.quat_rotate(q, spread(turn, vec3(real(0.0), real(0.0), part)))
             q = wp.normalize(q * exponential(turn))
             s = stop

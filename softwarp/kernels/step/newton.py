@@ -200,9 +200,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         value_out: wp.array3d(dtype=real),
     ):
-        """Clear what a failed solve left, such as forces of contacts."""
+        """Clear what a failed solve left, such as forces of contacts, and what one at a rejected iterate left in vain.
+
+        The next step starts from them, and no step could mend forces that are not finite.
+        """
         pack, row, lane = wp.tid()
-        if control_in[pack, wp.static(FAILED), lane] > real(0.5):
+        failed = control_in[pack, wp.static(FAILED), lane] > real(0.5)
+        if failed or not wp.isfinite(value_out[pack, row, lane]):
             value_out[pack, row, lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)

@@ -140,7 +140,7 @@ class TelescopeTerm(Term):
         s.each_real(self.k.drive, m.count, inputs, [w.prescribed_v.real])
 
     def restrain(self, h: float, part: float) -> None:
-        """Worlds whose lines swing more than a linearisation holds go a part of their way."""
+        """Worlds whose lines swing more than a linearisation holds go a part of their way; no segment turns over."""
         s, w, m, f, most = self.shard, self.shard.work, self.model, self.frames, part * self.shard.options.most_swing
         if math.isinf(most) and math.isinf(s.options.repeat_swing):
             return
@@ -154,6 +154,9 @@ class TelescopeTerm(Term):
             s.each_real(k.share_of_way, None, [h, most, *inputs], found)
         inputs = [s.model.dof_free, w.share_of_way.real]
         s.each_real(self.k_restraint.hold_back, s.variant.parts(s.model.dof_count), inputs, [w.u.real])
+        linear = s.options.newton_iterations == 1  # looks at contacts have moved the poses since
+        inputs = [h, m.pieces, m.base_frame, f.frame_dof, s.model.dof_free]
+        s.each_real(k.hold_turns, None, [*inputs, s.input["pose0"].real if linear else w.pose.real], [w.u.real])
 
     def write(self) -> None:
         """Lengths, angles and sections of good worlds."""

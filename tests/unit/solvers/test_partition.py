@@ -5,7 +5,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.solvers.partition import LANES_FROM, choose_variant
+from softwarp.solvers.partition import LANES_FROM, choose_variant, free_ranges, world_ranges
 
 
 def scene(worlds: int, precision: str = "float32") -> sw.Model:
@@ -56,3 +56,18 @@ def test_unknown_paths_and_those_of_a_gpu_are_refused():
         choose_variant(scene(1), "simd")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="'panels' is for a GPU; for device 'cpu' choose auto, scalar or lanes"):
         choose_variant(scene(1), "panels")
+
+
+def test_uneven_steps_have_shards_to_spare():
+    """Threads that are free take what is left of them; every world is in one, and a single thread needs no others."""
+    for precision, count, most in (("float64", 16, 4), ("float32", 8, 8)):
+        model = scene(64, precision)
+        chosen = choose_variant(model, "auto")
+        ranges, is_free = free_ranges(chosen, model, 2, True)
+        assert is_free and len(ranges) == count and max(b - a for a, b in ranges) == most
+        assert [a for a, _ in ranges] == [0, *(b for _, b in ranges[:-1])] and ranges[-1][1] == 64
+        assert free_ranges(chosen, model, 2, False) == (world_ranges(chosen, model, 2), False)
+        assert len(world_ranges(chosen, model, 2)) == 2
+        assert free_ranges(chosen, model, 1, True) == ([(0, 64)], False)
+    few = scene(5)
+    assert free_ranges(choose_variant(few, "scalar"), few, 2, True) == ([(0, 3), (3, 5)], False)
