@@ -360,15 +360,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
         weight: wp.array3d(dtype=real),
         lever: wp.array3d(dtype=real),
     ):
-        """A contact without a place and without dofs."""
+        """A contact without a place and without dofs; slots behind the first empty one are as empty."""
         slot = c * wp.static(SLOTS)
-        for k in range(wp.static(SLOTS)):
+        k = int(0)
+        while k < wp.static(SLOTS):
+            if dof[pack, slot + k, lane] == -1:
+                break
             dof[pack, slot + k, lane] = -1
             weight[pack, slot + k, lane] = real(0.0)
-        for k in range(wp.static(3 * SLOTS)):
-            lever[pack, 3 * slot + k, lane] = real(0.0)
-        for k in range(3):
-            point[pack, 3 * c + k, lane] = real(0.0)
+            for i in range(3):
+                lever[pack, 3 * (slot + k) + i, lane] = real(0.0)
+            k += 1
+        for i in range(3):
+            point[pack, 3 * c + i, lane] = real(0.0)
 
     @wp.func
     def touch_vector(touch: wp.array3d(dtype=real), pack: int, row: int, lane: int):
