@@ -589,8 +589,8 @@ def rightly_accepted(name: str, good: dict[str, Any]) -> dict[str, set[str]]:
         accepted |= {"vessel": {"text", "empty text"}, "force_limit": {"inf"}, "max_insertion_force": {"inf"}}
     if name == "CatheterBeam":  # whose force has no limit, and which does not start nested
         accepted |= {"force_limit": {"inf"}, "max_insertion_force": {"inf"}, "nested": set()}
-    if name == "Diamond":  # whose cables may have no limits
-        accepted |= {"min_displacement": {"-inf", "-1", "-1.5"}, "max_displacement": {"inf"}}
+    if name == "Diamond":  # whose cables may have no limits, and whose moduli are fitted to one mesh
+        accepted |= {"min_displacement": {"-inf", "-1", "-1.5"}, "max_displacement": {"inf"}, "coarsened": set()}
     if name == "Maze":  # whose angles count from the flat state, outwards negative, and whose servos may have no limits
         accepted |= {key: {"-1", "-1.5"} for key in ("servo_height", "angle")} | {"max_angle": {"inf", "-1"}}
         accepted |= {"min_angle": {"-inf", "-1", "-1.5"}, "max_speed": {"inf"}, "max_torque": {"inf"}}

@@ -179,6 +179,7 @@ def _fit_calls() -> list[Call]:
         Call("fit", identification.fit, fit, {"batch": NONE, "method": NONE}),
         Call("PointEffector", control.PointEffector, {"markers": (0,), "axes": "xyz", "weight": 1.0}),
         Call("OrientationEffector", control.OrientationEffector, {"frame": 0, "length": 0.1, "axes": "xyz"}),
+        Call("Grip", control.Grip, {"pair": 0, "least": 0.5, "most": 6.0}, {"most": {"inf"}}),
         Call("TargetPath", control.TargetPath, {"times": np.array([0.0, 1.0]), "targets": np.zeros((2, 3))}),
     ]
 

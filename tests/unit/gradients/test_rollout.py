@@ -160,12 +160,6 @@ def _two_boxes(builder: sw.ModelBuilder) -> None:
     builder.add_contact(one, other)
 
 
-def _relaxing_beside_a_hinge(builder: sw.ModelBuilder) -> None:
-    _box(builder, relaxation=(0.4, 0.02))
-    link = builder.add_rigid(sw.Sphere(0.1), mass=1.0)
-    builder.add_joint(None, link, "hinge", anchor=(0.0, 0.0, 0.0))
-
-
 def _inflated(builder: sw.ModelBuilder) -> None:
     skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
     builder.add_cavity(_box(builder), skin.nodes + 0.03, skin.surface(), control="volume")
@@ -179,8 +173,6 @@ def _inflated_beside_a_rod(builder: sw.ModelBuilder) -> None:
 REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] = [
     (_box, {"integrator": "trapezoidal"}, "take integrator='bdf2' or 'euler'"),
     (_contact_plane, {"integrator": "bdf2"}, "contact has no gradient with integrator 'bdf2'"),
-    (_contact_plane, {"newton_iterations": 3}, "take newton_iterations=1"),
-    (_relaxing_beside_a_hinge, {}, "the relaxation of body 'body0' beside joints has no gradient yet"),
     (_pieces, {}, "a rod that contact cuts into pieces has no gradient yet; leave contact_pieces out"),
     (_tubes, {}, "tubes that slide in each other"),
     (_touching_rod, {}, "as that of rods; take a shape, a mesh or a soft body"),
