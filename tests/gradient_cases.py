@@ -56,6 +56,7 @@ def cube(
     chamber: dict[str, Any] | None = None,
     locked: bool = True,
     covered: bool = False,
+    graded: bool = False,
     **options: Any,
 ) -> sw.Simulation:
     """A cube of 2 x 2 x 2 cells, held at x = 0, with a cable of each control, a chamber with a rate and a marker.
@@ -70,12 +71,15 @@ def cube(
         chamber: Control and limits of the chamber; pressure control with a rate if left out.
         covered: Glue a membrane to the cube's surface; its corners are those of linear elements.
         locked: A corner moves along x and z only.
+        graded: The modulus grows from element to element, from 0.6 to 1.7 times.
         **options: Of the simulation.
     """
     builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
     size = (SIDE, SIDE, SIDE)
+    mesh = meshing.elevate(meshing.box(size, (1, 1, 1))) if quadratic else meshing.box(size, (2, 2, 2))
     body = builder.add_tets(
-        meshing.elevate(meshing.box(size, (1, 1, 1))) if quadratic else meshing.box(size, (2, 2, 2)),
+        mesh,
+        stiffness=np.linspace(0.6, 1.7, 6 if quadratic else 48) if graded else None,
         material=material(law, 1e5, 0.4),
         density=1000.0,
         rayleigh=(0.5, 0.01),

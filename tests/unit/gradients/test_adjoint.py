@@ -76,10 +76,17 @@ def test_refinement(refinement: int, integrator: str) -> None:
     check(Rollout(sim), inputs(sim, [1]), weights(sim))
 
 
-def test_gradients_of_the_exact_tangent() -> None:
-    """Without projection, A has negative eigenvalues of elements in it."""
-    sim = cube("nh_log", project_tangent=False)
+@pytest.mark.parametrize("graded", [False, True])
+def test_gradients_of_the_exact_tangent(graded: bool) -> None:
+    """Without projection, A has negative eigenvalues of elements in it; elements may have moduli of their own."""
+    sim = cube("nh_log", project_tangent=False, graded=graded)
     check(Rollout(sim), inputs(sim, [1], 0.3), weights(sim))
+
+
+def test_factors_of_quadratic_elements() -> None:
+    """Moduli of elements that have several Gauss points each."""
+    sim = cube("warped", quadratic=True, graded=True)
+    check(Rollout(sim), inputs(sim, [2], 0.3), weights(sim))
 
 
 @pytest.mark.parametrize(
