@@ -148,10 +148,47 @@ def _part_calls() -> list[Call]:
             telescope,
             {"lengths": NONE, "angles": SIGNED, "windup": {"flag"}, "contact_radius": NONE, "name": TEXT},
         ),
+        *_tied_calls(mesh),
         Call("OneOf", shapes.OneOf, {"meshes": one, "name": "o"}, {"name": TEXT}),
         Call("principal", shapes.principal, {"mass": 1.0, "inertia": np.eye(3), "name": "b"}, {"name": TEXT}),
         Call("rayleigh", sw.rayleigh, {"first": (5.0, 0.05), "second": (20.0, 0.05)}),
         Call("von_mises", sw.von_mises, {"tensor": torch.zeros(2, 3, 3)}),
+    ]
+
+
+def _tied_calls(mesh: meshing.TetMesh) -> list[Call]:
+    """Springs, elastic cables, and what a soft body has besides its elements."""
+    law = sw.Corotational(1e5, 0.3)
+
+    def with_block(method: str) -> Callable[..., Any]:
+        def call(**given: Any) -> None:
+            builder = sw.ModelBuilder()
+            body = builder.add_tets(mesh, material=law, density=1e3)
+            getattr(builder, method)(body, **given)
+
+        return call
+
+    spring = {"b": 0, "points": [[0.0, 0.0, 0.0], [0.1, 0.1, 0.1]], "stiffness": 1.0, "damping": 1.0}
+    spring |= {"rest_length": 0.1, "only_pulls": True, "tolerance": 1e-6, "name": "s"}
+    cable = {"waypoints": spring["points"], "stiffness": 1.0, "damping": 1.0}
+    options = {"relaxation": (0.5, 0.1), "stiffness": np.ones(len(mesh.tets)), "contact_surface": mesh.nodes[:4]}
+    lengths = {"rest_length": NONE, "tolerance": NONE}
+    return [
+        Call(
+            "add_spring",
+            with_block("add_spring"),
+            spring,
+            lengths | {"only_pulls": {"flag"}, "name": TEXT},
+            {"b": ("body",)},
+        ),
+        Call("add_cable that stretches", with_block("add_cable"), cable),
+        Call(
+            "add_tets with more",
+            lambda **given: sw.ModelBuilder().add_tets(mesh, material=law, density=1e3, **given),
+            options,
+            {"stiffness": NONE, "contact_surface": NONE},
+            {"contact_surface": ("surface",)},
+        ),
     ]
 
 

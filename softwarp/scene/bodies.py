@@ -92,16 +92,12 @@ def _stiffness(
     value: ArrayLike, mesh: meshing.TetMesh, quadratic: meshing.QuadraticMesh | None, label: str
 ) -> FloatArray:
     """Factors of the modulus, (m,) of linear tets, (m, 4) of the Gauss points of quadratic ones."""
-    found = checks.as_array(value).astype(np.float64)
-    if quadratic is None:
-        shapes: list[tuple[int, ...]] = [(len(mesh.tets),)]
-    else:
-        shapes = [(len(quadratic.elements),), (len(quadratic.elements), POINTS)]
-    if found.shape not in shapes or not (np.isfinite(found) & (found > 0.0)).all():
-        told = " or ".join(map(str, shapes))
-        raise ValueError(
-            f"body {label!r}: stiffness must be positive and finite, of shape {told}, got shape {found.shape}"
-        )
+    count = len(mesh.tets) if quadratic is None else len(quadratic.elements)
+    shapes = [(count,)] if quadratic is None else [(count,), (count, POINTS)]
+    told = " or ".join(map(str, shapes))
+    found = checks.array(
+        value, f"body {label!r}: stiffness", *shapes, above=0.0, need=f"be positive and finite, of shape {told}"
+    )
     return np.repeat(found[:, None], POINTS, axis=1) if quadratic is not None and found.ndim == 1 else found
 
 
@@ -117,6 +113,8 @@ def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSu
         value = meshing.SurfaceMesh(value[0], value[1], name)
     if isinstance(value, np.ndarray | tuple | list):
         points = checks.as_array(value)
+        if points.shape == (0, 3):
+            raise MeshError(f"{name}: has no points; give some, a surface, or None for the boundary")
         spacing = meshing.mean_edge(mesh.nodes, meshing.tet_surface(mesh.tets))
     else:
         surface = meshing.as_surface(value, name=name)

@@ -106,8 +106,8 @@ def add_spring(
 
 def _elastic(stiffness: float, damping: float, control: str, label: str) -> dict[str, float]:
     """Stiffness and damping of a cable, by their names in ``Parameters``."""
+    stiffness = checks.number(stiffness, f"{label}: stiffness [N/m]", above=0.0, infinite=True)
     if stiffness != math.inf:
-        checks.number(stiffness, f"{label}: stiffness [N/m]", above=0.0)
         if control != "length":
             raise ValueError(
                 f"{label}: stiffness needs control='length', got {control!r}: an imposed tension is the same whether "

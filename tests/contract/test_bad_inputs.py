@@ -51,7 +51,7 @@ def test_every_bad_value_of_every_argument_is_refused(call):
 def test_no_call_is_missing():
     """The builder's methods, the solver's options and all registered environments are among the calls."""
     named = {call.name.split()[0] for call in ALL}
-    methods = {name for name in vars(sw.ModelBuilder) if name.startswith("add_")} | {"fix", "attach", "finalize"}
+    methods = {name for name in dir(sw.ModelBuilder) if name.startswith("add_")} | {"fix", "attach", "finalize"}
     assert methods | {"Options", *registry.names()} <= named
     public = {name for module in (meshing, reduction, identification, gradients, control) for name in module.__all__}
     assert public - RECORDS - ELSEWHERE <= named

@@ -132,6 +132,7 @@ def test_state_and_fingerprint_know_the_surface() -> None:
     ("surface", "message"),
     [
         (np.zeros((3, 2)), r"contact_surface: points must have shape \(point, 3\)"),
+        (np.zeros((0, 3)), "contact_surface: has no points"),
         (np.full((2, 3), np.nan), "contact_surface: point 0 is not finite"),
         (np.full((2, 3), 1.0), "contact_surface: point 0 .* outside the mesh"),
         (SurfaceMesh(skin(2).nodes, skin(2).triangles[:, ::-1]), "look inwards; swap two corners"),

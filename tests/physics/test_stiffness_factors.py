@@ -48,7 +48,19 @@ def test_factors_of_the_modulus_are_those_of_another_material(element):
     assert row == pytest.approx(100.0 / 1.0e5 * 0.025 * (1.0 + 1.0 + 0.5 + 0.25), rel=1e-6)
 
 
-@pytest.mark.parametrize("bad", [np.ones(3), -np.ones(720), np.full(720, np.nan), np.ones((720, 3))])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.ones(3),
+        -np.ones(720),
+        np.full(720, np.nan),
+        np.ones((720, 3)),
+        "soft",
+        {},
+        np.ones(720, dtype=complex),
+        np.full(720, 1e300),
+    ],
+)
 def test_factors_are_refused(bad):
     with pytest.raises(ValueError, match="stiffness must be positive and finite, of shape"):
         sw.ModelBuilder().add_tets(
