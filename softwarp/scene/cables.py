@@ -42,11 +42,11 @@ def add_cable(
     points = checks.array(waypoints, f"{label}: waypoints", (None, 3), need="be finite with shape (p, 3)")
     anchor = None if pull_point is None else vector(pull_point, f"{label}: pull_point")
     carriers = _carriers(scene, body, len(points), label)
-    patches = _checked_patches(scene, carriers, points, patches or {}, label)
+    shared = _checked_patches(scene, carriers, points, patches or {}, label)
     if pull_on is not None:
         if anchor is None:
             raise ValueError(f"{label}: pull_on needs a pull_point, the place [m] that part {pull_on!r} carries")
-        patches = {i + 1: patch for i, patch in patches.items()}
+        shared = {i + 1: patch for i, patch in shared.items()}
         carriers, points, anchor = [scene.part(pull_on), *carriers], np.vstack([anchor, points]), None
     elastic = _elastic(stiffness, damping, control, label)
     _check_path(points if anchor is None else np.vstack([anchor, points]), closing_length, label)
@@ -62,11 +62,11 @@ def add_cable(
     _check_limits(bounds, label)
     tolerance = distance(tolerance, f"{label}: tolerance")
     tets, weights = _embedded(scene, carriers, points, tolerance, label)
-    for i, (nodes, shares) in patches.items():
+    for i, (nodes, shares) in shared.items():
         weights[i] = 0.0
         weights[i, : len(nodes)] = shares
     bounds |= elastic
-    patch_nodes = {i: nodes for i, (nodes, _) in patches.items()}
+    patch_nodes = {i: nodes for i, (nodes, _) in shared.items()}
     is_forced, closing = control == "force", float(closing_length)
     scene.cables.append(
         CableSpec(label, carriers, points, anchor, is_forced, bounds, tets, weights, closing, patch_nodes)
