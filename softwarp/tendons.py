@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from numpy.typing import ArrayLike
@@ -33,6 +33,7 @@ class Tendons:
         stiffness: float = math.inf,
         damping: float = 0.0,
         pull_on: int | None = None,
+        patches: Mapping[int, tuple[ArrayLike, ArrayLike]] | None = None,
         tolerance: float | None = None,
         name: str | None = None,
     ) -> int:
@@ -57,6 +58,8 @@ class Tendons:
                 not stretch.
             damping: Tension per speed of stretching [N s/m], of an elastic cable.
             pull_on: Part that carries the pull point, such as the wrist of a hand.
+            patches: For waypoints that pull at an area of a soft body rather than at a point, by their number: up to
+                four of its nodes and the share of each. The waypoint is their mean, and must be given so.
             tolerance: Distance [m] that a waypoint may lie outside the body's faceted surface.
             name: For messages and exports.
 
@@ -78,6 +81,7 @@ class Tendons:
             stiffness=stiffness,
             damping=damping,
             pull_on=pull_on,
+            patches=patches,
             tolerance=tolerance,
             name=name,
         )

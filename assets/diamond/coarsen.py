@@ -35,7 +35,6 @@ HEADER = "fitted,gravity_x,gravity_z,east,west,north_south," + ",".join(
 )
 SIDES = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0))  # east, west, north
 PULL = np.array([-0.087, -0.015]) / np.hypot(0.087, 0.015)  # along the side's axis and up, from elbow to anchor
-ROWS = slice(6, 9)  # of SECTIONS: the outer faces between them are pulled
 FINE = (2, 3)  # as many times the coarse mesh's cells along every edge
 ORDER = 2  # in which ways converge
 WEIGHT = (1.0, 0.3, 0.3, 0.3)  # of errors of top and elbows
@@ -70,15 +69,16 @@ class Half:
         for side in SIDES:
             builder.add_traction(body, where=_outer(side))
             builder.add_marker(body, (0.0925 * side[0], 0.0925 * side[1], 0.045))
+        self.patches = [(traction.node, traction.share) for traction in builder.scene.tractions]
         self.sim = softwarp.Simulation(builder.finalize(len(loads), "cpu", "float64"))
         assert self.sim.model.quadratic is not None
         self.weights = self.sim.model.quadratic.point_volume.numpy()
         self._unweighted = self.weights.copy()
-        self._start = self.sim.marker_x[0].numpy().copy()
+        self.start = self.sim.marker_x[0].numpy().copy()
         self.sim.params.gravity.copy_(torch.tensor([(x, 0.0, z) for x, z in loads[:, :2]]))
         for i, side in enumerate(SIDES):
             pull = np.array([PULL[0] * side[0], PULL[0] * side[1], PULL[1]])
-            self.sim.control.traction[:, i] = torch.tensor(loads[:, 2 + i, None] / _outer_area() * pull)
+            self.sim.control.traction[:, i] = torch.tensor(loads[:, 2 + i, None] / outer_area() * pull)
 
     def ways(self, stiffness: Floats | None = None) -> Floats:
         """Of top and elbows [m], (load, 4, 3), with factors of the modulus, (tet,)."""
@@ -86,7 +86,14 @@ class Half:
         self.weights[:] = self._unweighted * factors
         if not self.sim.solve_static().converged.all():
             raise RuntimeError("a load has no equilibrium")
-        return np.asarray(self.sim.marker_x.numpy() - self._start)
+        return np.asarray(self.sim.marker_x.numpy() - self.start)
+
+    def patch_means(self) -> Floats:
+        """Mean places of the faces that are pulled, of whole elbows [m], (load, 3, 3)."""
+        x = self.sim.node_x.numpy()
+        found = np.stack([share @ x[:, node] / share.sum() for node, share in self.patches], axis=1)
+        found[:, :2, 1] = 0.0  # the other half is the mirror image
+        return np.asarray(found)
 
 
 def _outer(side: Sequence[float]) -> Callable[[Floats], NDArray[np.bool_]]:
@@ -101,9 +108,9 @@ def _outer(side: Sequence[float]) -> Callable[[Floats], NDArray[np.bool_]]:
     return where
 
 
-def _outer_area() -> float:
+def outer_area() -> float:
     """Of the faces that are pulled at a whole elbow [m^2]."""
-    rows = np.array(diamond_geometry.SECTIONS)[ROWS]
+    rows = np.array(diamond_geometry.SECTIONS)[diamond_geometry.PATCH_ROWS]
     lengths = np.hypot(*np.diff(rows[:, 2:4], axis=0).T)
     return float((lengths * (rows[1:, 4] + rows[:-1, 4])).sum())
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from softwarp.meshing.prisms import cut_prisms, split_quads
 from softwarp.meshing.resolutions import check_name
-from softwarp.meshing.tets import FloatArray, TetMesh, orient
+from softwarp.meshing.tets import FloatArray, MeshError, TetMesh, orient
 
 HUB_HALF = 0.017  # half width of the square blocks at the base and at the top where the legs meet
 TOP_MIDDLE = (0.1139, 0.1257)  # height of the top's middle, inside and outside
@@ -42,6 +42,10 @@ SECTIONS = (
 # Factors of the modulus with which quadratic elements of the coarse mesh move as converged ones do: rows of SECTIONS
 # and factors there, linear in between, for nu = 0.45. assets/diamond/coarsen.py fits them.
 COARSE_STIFFNESS = ((2.0, 6.0, 8.0, 12.0), (0.868, 1.090, 0.621, 0.549))
+
+# Rows of SECTIONS between which the outer face of an elbow carries the end of a cable, 17 mm high, where it is spread.
+PATCH_ROWS = slice(6, 9)
+OFF_PATCH = 0.0005  # m, how far a node may lie from the middle of a quarter of it: on a facet between curved sections
 
 # Cells through the thickness of a leg, across it, and between two rows of SECTIONS.
 DETAILS = {"coarse": (1, 2, 1), "medium": (2, 4, 2), "fine": (3, 6, 3)}
@@ -100,6 +104,29 @@ def diamond_places(resolution: str = "medium") -> FloatArray:
     block, slab = 6 * layers * across**2, 6 * layers * across  # tets: two triangles a cell, three a prism
     leg = np.repeat((np.arange(parts * rows) + 0.5) / parts, slab)
     return np.concatenate([np.repeat([0.0, float(rows)], block), *[leg] * 4])
+
+
+def elbow_patch(nodes: FloatArray, side: tuple[float, float]) -> tuple[NDArray[np.int64], FloatArray]:
+    """Nodes in the middles of the four quarters of an elbow's outer face, and the parts of its area around them.
+
+    Args:
+        nodes: Of a mesh [m], (node, 3): linear "medium" or quadratic "coarse" ones have such nodes.
+        side: Direction of the leg, in the plane.
+
+    Raises:
+        MeshError: If there is no node in the middle of a quarter.
+    """
+    rows = np.array(SECTIONS)[PATCH_ROWS]
+    out, across = np.array([*side, 0.0]), np.array([-side[1], side[0], 0.0])
+    middles, areas = [], []
+    for low, high in itertools.pairwise(rows):
+        x, z, half = 0.5 * (low + high)[2:]
+        middles += [x * out + sign * 0.5 * half * across + [0.0, 0.0, z] for sign in (-1.0, 1.0)]
+        areas += [half * float(np.hypot(*(high - low)[2:4]))] * 2
+    off = np.linalg.norm(nodes[None] - np.array(middles)[:, None], axis=2)
+    if off.min(axis=1).max() > OFF_PATCH:
+        raise MeshError("diamond: no node lies in the middle of each quarter of an elbow's outer face; refine the mesh")
+    return off.argmin(axis=1), np.array(areas) / sum(areas)
 
 
 def coarse_stiffness() -> FloatArray:

@@ -56,7 +56,9 @@ def cable_points(scene: Scene, soft: SoftLayout) -> Points:
             anchors.append(cable.pull_point[None])
         corners, shares = np.full((len(cable.waypoints), 4), -1, dtype=np.int32), cable.weights.copy()
         for i, (part, tet) in enumerate(zip(cable.carriers, cable.tets, strict=True)):
-            if tet >= 0:
+            if i in cable.patches:
+                corners[i, : len(cable.patches[i])] = soft.node_start[part] + cable.patches[i]
+            elif tet >= 0:
                 corners[i] = soft.carriers[soft.carrier_start[part] + tet]
             else:
                 corners[i, 0], shares[i, 0], guide = guide, 1.0, guide + 1

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,8 @@ from softwarp import checks, meshing
 from softwarp.model.handles import Handle, RigidBody, Rod, SoftBody
 from softwarp.scene.checks import distance, limits, to_local, vector
 from softwarp.scene.parts import CableSpec, FloatArray, IntArray, MarkerSpec, Scene
+
+PATCH = 4  # nodes of one, as many as carry a point
 
 
 def add_cable(
@@ -31,6 +33,7 @@ def add_cable(
     stiffness: float = math.inf,
     damping: float = 0.0,
     pull_on: int | None = None,
+    patches: Mapping[int, tuple[ArrayLike, ArrayLike]] | None = None,
     tolerance: float | None,
     name: str | None,
 ) -> int:
@@ -39,9 +42,11 @@ def add_cable(
     points = checks.array(waypoints, f"{label}: waypoints", (None, 3), need="be finite with shape (p, 3)")
     anchor = None if pull_point is None else vector(pull_point, f"{label}: pull_point")
     carriers = _carriers(scene, body, len(points), label)
+    shared = _checked_patches(scene, carriers, points, patches or {}, label)
     if pull_on is not None:
         if anchor is None:
             raise ValueError(f"{label}: pull_on needs a pull_point, the place [m] that part {pull_on!r} carries")
+        shared = {i + 1: patch for i, patch in shared.items()}
         carriers, points, anchor = [scene.part(pull_on), *carriers], np.vstack([anchor, points]), None
     elastic = _elastic(stiffness, damping, control, label)
     _check_path(points if anchor is None else np.vstack([anchor, points]), closing_length, label)
@@ -57,9 +62,14 @@ def add_cable(
     _check_limits(bounds, label)
     tolerance = distance(tolerance, f"{label}: tolerance")
     tets, weights = _embedded(scene, carriers, points, tolerance, label)
+    for i, (nodes, shares) in shared.items():
+        weights[i] = 0.0
+        weights[i, : len(nodes)] = shares
     bounds |= elastic
+    patch_nodes = {i: nodes for i, (nodes, _) in shared.items()}
+    is_forced, closing = control == "force", float(closing_length)
     scene.cables.append(
-        CableSpec(label, carriers, points, anchor, control == "force", bounds, tets, weights, float(closing_length))
+        CableSpec(label, carriers, points, anchor, is_forced, bounds, tets, weights, closing, patch_nodes)
     )
     return len(scene.cables) - 1
 
@@ -102,6 +112,36 @@ def add_spring(
         tolerance=tolerance,
         name=label,
     )
+
+
+def _checked_patches(
+    scene: Scene, carriers: list[Handle], points: FloatArray, patches: Mapping[int, Any], label: str
+) -> dict[int, tuple[IntArray, FloatArray]]:
+    """Nodes and shares of every patch.
+
+    Raises:
+        ValueError: For a waypoint that does not exist or that no soft body carries, nodes that do not exist or occur
+            twice, more than four, shares that are none or do not add up to 1, and a waypoint that is not their mean.
+    """
+    checked = {}
+    for i, patch in patches.items():
+        if i not in range(len(points)) or not isinstance(carriers[i], SoftBody):
+            raise ValueError(f"{label}: patches: {i!r} must be the number of a waypoint that a soft body carries")
+        what = f"{label}: patch of waypoint {i}"
+        if not isinstance(patch, tuple) or len(patch) != 2:
+            raise ValueError(checks.refusal(what, "be nodes and their shares", patch))
+        rest = scene.bodies[carriers[i]].mesh.nodes
+        nodes = checks.integers(patch[0], f"{what}: nodes", (None,), high=len(rest) - 1)
+        shares = checks.array(patch[1], f"{what}: shares", (len(nodes),), need=f"be finite, {len(nodes)} of them")
+        if not 1 <= len(nodes) <= PATCH or len(set(nodes.tolist())) < len(nodes):
+            raise ValueError(f"{what}: give 1 to {PATCH} different nodes, got {nodes.tolist()}")
+        if abs(shares.sum() - 1.0) > 1e-6 or shares.min() <= 0.0:
+            raise ValueError(f"{what}: shares must be positive and add up to 1, got {shares.tolist()}")
+        mean = shares @ rest[nodes]
+        if np.linalg.norm(mean - points[i]) > 1e-6 * np.ptp(rest, axis=0).max():
+            raise ValueError(f"{what}: waypoint {points[i].tolist()} must be the mean of the patch, {mean.tolist()}")
+        checked[i] = nodes, shares / shares.sum()
+    return checked
 
 
 def _elastic(stiffness: float, damping: float, control: str, label: str) -> dict[str, float]:

@@ -157,6 +157,7 @@ class CableSpec:
     tets: IntArray  # (p,) tet of the soft body, -1 for a waypoint on a rod or a rigid body
     weights: FloatArray  # (p, 4)
     closing_length: float  # [m]
+    patches: dict[int, IntArray] = field(default_factory=dict)  # nodes that carry a waypoint
 
     @property
     def is_elastic(self) -> bool:

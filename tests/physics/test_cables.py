@@ -351,3 +351,62 @@ def test_residual_is_reported() -> None:
     settle(case, 5)
     assert case.sim.residual.shape == (1, 1) or case.sim.residual.shape == (1,)
     assert float(case.sim.residual.max()) < 1e-9
+
+
+SHARES = np.array([0.1, 0.2, 0.3, 0.4])
+
+
+def patched(patch: tuple[Any, Any] | None, waypoint: np.ndarray | None = None) -> tuple[sw.Simulation, np.ndarray]:
+    """A beam whose end is pulled sideways by a far cable at its corners, or by nothing, and these corners."""
+    mesh = meshing.box((LENGTH, WIDTH, WIDTH), (8, 2, 2))
+    corners = np.flatnonzero(cases.on_plane(mesh, 0, LENGTH))[[0, 2, 6, 8]]
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = builder.add_tets(mesh, material=cases.material("corot", YOUNGS, NU), density=1000.0)
+    builder.fix(body, nodes=np.flatnonzero(cases.on_plane(mesh, 0, 0.0)))
+    mean = SHARES @ mesh.nodes[corners]
+    if patch is not None:
+        given = mean if waypoint is None else waypoint
+        shares = (corners, SHARES) if patch == () else patch
+        anchor = (mean[0], mean[1], mean[2] - 1.0e5)
+        builder.add_cable(body, [given], anchor, control="force", patches={0: shares}, name="pull")
+    return sw.Simulation(builder.finalize(1, precision="float64")), corners
+
+
+def test_a_patch_shares_the_pull_among_its_nodes() -> None:
+    """As forces in these shares do, and the cable's length is that to their mean."""
+    sim, corners = patched(())
+    sim.control.cable_tension[:] = 0.1
+    assert sim.solve_static().converged.all()
+    free, _ = patched(None)
+    free.control.node_force[0, torch.tensor(corners), 2] = torch.tensor(-0.1 * SHARES)
+    assert free.solve_static().converged.all()
+    moved = sim.node_x[0] - torch.tensor(np.asarray(sim.model.node_rest))
+    np.testing.assert_allclose(sim.node_x.numpy(), free.node_x.numpy(), atol=1e-6 * float(moved.abs().max()))
+    way = float(torch.tensor(SHARES) @ moved[torch.tensor(corners), 2])
+    assert way < -1e-3
+    assert value(sim.cable_displacement) == pytest.approx(-way, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("patch", "told"),
+    [
+        (([0, 1, 2, 3, 4], [0.2] * 5), "give 1 to 4 different nodes"),
+        (([8, 8], [0.5, 0.5]), "give 1 to 4 different nodes"),
+        (([8, 17], [0.5, 0.6]), "shares must be positive and add up to 1"),
+        (([8, 17], [1.5, -0.5]), "shares must be positive and add up to 1"),
+        (([8, 17], [0.5]), "shares"),
+        (([8, 100000], [0.5, 0.5]), "nodes"),
+        (([8, 17], [0.5, 0.5]), "must be the mean of the patch"),
+        ([8, 17], "be nodes and their shares"),
+    ],
+)
+def test_patches_that_are_none_are_refused(patch: Any, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        patched(patch)
+
+
+def test_patches_belong_to_waypoints_of_soft_bodies() -> None:
+    builder = sw.ModelBuilder()
+    rigid = builder.add_rigid(sw.shapes.Box((0.1, 0.1, 0.1)), mass=1.0)
+    with pytest.raises(ValueError, match="0 must be the number of a waypoint that a soft body carries"):
+        builder.add_cable(rigid, [(0.0, 0.0, 0.0)], (1.0, 0.0, 0.0), patches={0: ([0], [1.0])})

@@ -45,6 +45,7 @@ class DiamondSceneConfig(FidelityConfig):
     element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
     coarsened: bool = False  # moduli along the legs with which the coarse mesh of "p2" moves as converged ones do
+    cable_ends: str = "points"  # what they pull at: "points" of elbows, which sink in, or "patches", 17 mm high
     total_mass: Mass = 0.5  # kg
     lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
     rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness
@@ -60,6 +61,7 @@ class DiamondSceneConfig(FidelityConfig):
         "element": "p2",
         "rotation": "warped",
         "coarsened": True,
+        "cable_ends": "patches",
     }
 
     def __post_init__(self) -> None:
@@ -73,6 +75,7 @@ class DiamondSceneConfig(FidelityConfig):
             )
         check_choice(self, "element", ("p1", "p2"))
         check_choice(self, "rotation", ROTATIONS)
+        check_choice(self, "cable_ends", ("points", "patches"))
         check_choice(self, "lumping", ("uniform", "volume"))
         if not self.min_displacement < self.max_displacement:
             raise ValueError(

@@ -14,13 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
+import numpy as np
+
 from softwarp import meshing
 from softwarp.advice import nearest
 from softwarp.builder import ModelBuilder
 from softwarp.envs.options.diamond import CABLES as CABLES
 from softwarp.envs.options.diamond import ROTATIONS as ROTATIONS
 from softwarp.envs.options.diamond import DiamondSceneConfig
-from softwarp.meshing.diamond_geometry import coarse_stiffness
+from softwarp.meshing.diamond_geometry import coarse_stiffness, elbow_patch
 from softwarp.meshing.trunk_geometry import CABLE_SIDES
 from softwarp.scene.materials import Corotational
 
@@ -59,20 +61,24 @@ def build_diamond_scene(config: DiamondSceneConfig, builder: ModelBuilder) -> Di
     half = config.base_half + 1.0e-9
     builder.fix(body, box=((-half, -half, -1.0), (half, half, _BASE_TOP)))
     elbows = [(_ELBOW[0] * x, _ELBOW[0] * y, _ELBOW[1]) for x, y in CABLE_SIDES]
+    nodes, are_spread = builder.bodies[body].mesh.nodes, config.cable_ends == "patches"
+    patches = [elbow_patch(nodes, side) for side in CABLE_SIDES] if are_spread else []
+    ends = [shares @ nodes[chosen] for chosen, shares in patches] if are_spread else np.array(elbows)
     cables = tuple(
         builder.add_cable(
             body,
-            [elbow],
+            ends[i : i + 1],
             (_ANCHOR[0] * x, _ANCHOR[0] * y, _ANCHOR[1]),
             control="length",
             min_tension=config.min_tension,
             min_displacement=config.min_displacement,
             max_displacement=config.max_displacement,
             max_rate=config.max_rate,
+            patches={0: patches[i]} if are_spread else None,
             tolerance=_OUTSIDE,
             name=f"cable_{name}",
         )
-        for elbow, (x, y), name in zip(elbows, CABLE_SIDES, ("north", "west", "south", "east"), strict=True)
+        for i, ((x, y), name) in enumerate(zip(CABLE_SIDES, ("north", "west", "south", "east"), strict=True))
     )
     points = [("effector", EFFECTOR), *((f"elbow_{i}", elbow) for i, elbow in enumerate(elbows))]
     points.append(("below_effector", BELOW_EFFECTOR))
