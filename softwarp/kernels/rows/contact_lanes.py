@@ -514,10 +514,10 @@ def kernels() -> SimpleNamespace:
     ):
         """All contacts of a pack as users see them."""
         w = wp.tid()
-        for contact in range(contact_pair_out.shape[1]):
+        for c in range(contact_pair_out.shape[1]):
             write_contact(
                 w,
-                contact,
+                c,
                 couple_sign,
                 flag_in,
                 count_in,
