@@ -1,8 +1,8 @@
-"""Rows of contacts of eight worlds in SIMD lanes: paths, sides, known gaps and forces, on a CPU in float32.
+"""Rows of contacts of eight worlds in SIMD lanes: paths, sides, known gaps, forces and outputs, on a CPU in float32.
 
-Results are those of the kernels for single worlds in ``contact`` and ``contact_force``, with the same bits. Worlds of a
-pack mostly touch with the same dofs, whose entries then are whole registers; where dofs differ, lanes are gathered.
-Theory: docs/theory/contact.md.
+Results are those of the kernels for single worlds in ``contact``, ``contact_force`` and ``collision.output``, with the
+same bits. Worlds of a pack mostly touch with the same dofs, whose entries then are whole registers; where dofs differ,
+lanes are gathered. Theory: docs/theory/contact.md.
 """
 
 from functools import cache
@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT, variant, vec8
+from softwarp.kernels.collision.output import NO_PAIR
 from softwarp.kernels.rows import contact, places
 from softwarp.model.codes import SLOTS
 
@@ -275,6 +276,72 @@ def push(
     """target += f P H' multiplier of all contacts of a pack, in their order."""
 
 
+@wp.func_native(
+    _TYPES
+    + """
+auto row = [](const float* rows, int number) {
+    lane_t value;
+    __builtin_memcpy(&value, rows + lanes * number, sizeof(value));
+    return value;
+};
+auto whole = [](const int* rows, int number) {
+    mask_t value;
+    __builtin_memcpy(&value, rows + lanes * number, sizeof(value));
+    return value;
+};
+const int* const flag = &wp::index(flag_in, w, 0, 0);
+const mask_t is_good = (whole(flag, 0) + whole(flag, 1)) == 0;
+const mask_t is_used = whole(&wp::index(count_in, w, 0, 0), 0) > contact;
+const mask_t pair = is_used ? whole(&wp::index(pair_in, w, contact, 0), 0) : mask_t{} + NO_PAIR;
+const mask_t couple = whole(&wp::index(couple_in, w, contact, 0), 0);
+const float* const axes = &wp::index(axes_in, w, 9 * contact, 0);
+const float* const place = &wp::index(point_in, w, 3 * contact, 0);
+const float* const multiplier = &wp::index(multiplier_in, w, 3 * contact, 0);
+const lane_t zero = {}, gap = is_used ? row(&wp::index(gap_in, w, contact, 0), 0) : zero;
+lane_t sign = {}, point[3], normal[3], load[3];
+for (int lane = 0; lane < lanes; ++lane)
+    if (is_used[lane]) sign[lane] = couple_sign.data[couple[lane]];
+for (int c = 0; c < 3; ++c) {
+    lane_t force = {};
+    for (int axis = 0; axis < 3; ++axis) force += row(axes, 3 * axis + c) * row(multiplier, axis);
+    point[c] = is_used ? row(place, c) : zero;
+    normal[c] = is_used ? sign * row(axes, c) : zero;
+    load[c] = is_used ? sign * force : zero;
+}
+for (int lane = 0; lane < lanes && lanes * w + lane < pair_out.shape[0]; ++lane) {
+    if (!is_good[lane]) continue;
+    const int world = lanes * w + lane;
+    wp::index(pair_out, world, contact) = pair[lane];
+    wp::index(gap_out, world, contact) = gap[lane];
+    for (int c = 0; c < 3; ++c) {
+        wp::index(point_out, world, 3 * contact + c) = point[c][lane];
+        wp::index(normal_out, world, 3 * contact + c) = normal[c][lane];
+        wp::index(load_out, world, 3 * contact + c) = load[c][lane];
+    }
+}
+""".replace("NO_PAIR", f"{NO_PAIR}")
+)
+def write_contact(
+    w: int,
+    contact: int,
+    couple_sign: wp.array(dtype=wp.int32),
+    flag_in: wp.array3d(dtype=wp.int32),
+    count_in: wp.array3d(dtype=wp.int32),
+    pair_in: wp.array3d(dtype=wp.int32),
+    couple_in: wp.array3d(dtype=wp.int32),
+    axes_in: wp.array3d(dtype=wp.float32),
+    point_in: wp.array3d(dtype=wp.float32),
+    gap_in: wp.array3d(dtype=wp.float32),
+    multiplier_in: wp.array3d(dtype=wp.float32),
+    pair_out: wp.array2d(dtype=wp.int32),
+    point_out: wp.array2d(dtype=wp.float32),
+    normal_out: wp.array2d(dtype=wp.float32),
+    load_out: wp.array2d(dtype=wp.float32),
+    gap_out: wp.array2d(dtype=wp.float32),
+):
+    """One contact of good worlds as users see it, as ``write_contacts`` of ``collision.output`` has it."""
+
+
 @cache
 def kernels() -> SimpleNamespace:
     """Compile-once set of kernels of packs of eight worlds."""
@@ -425,4 +492,52 @@ def kernels() -> SimpleNamespace:
         w = wp.tid()
         push(w, dof_free, count_in, dof_in, weight_in, lever_in, axes_in, multiplier_in, f_scale, target_out)
 
-    return SimpleNamespace(find_path=find_path, scatter_rows=scatter_rows, known_gap=known_gap, add_force=add_force)
+    @wp.kernel(module=module, enable_backward=False)
+    def write_contacts(
+        # Model
+        couple_sign: wp.array(dtype=wp.int32),
+        # Workspace in
+        flag_in: wp.array3d(dtype=wp.int32),
+        count_in: wp.array3d(dtype=wp.int32),
+        pair_in: wp.array3d(dtype=wp.int32),
+        couple_in: wp.array3d(dtype=wp.int32),
+        axes_in: wp.array3d(dtype=wp.float32),
+        point_in: wp.array3d(dtype=wp.float32),
+        gap_in: wp.array3d(dtype=wp.float32),
+        multiplier_in: wp.array3d(dtype=wp.float32),
+        # State out
+        contact_pair_out: wp.array2d(dtype=wp.int32),
+        contact_point_out: wp.array2d(dtype=wp.float32),
+        contact_normal_out: wp.array2d(dtype=wp.float32),
+        contact_load_out: wp.array2d(dtype=wp.float32),
+        contact_gap_out: wp.array2d(dtype=wp.float32),
+    ):
+        """All contacts of a pack as users see them."""
+        w = wp.tid()
+        for c in range(contact_pair_out.shape[1]):
+            write_contact(
+                w,
+                c,
+                couple_sign,
+                flag_in,
+                count_in,
+                pair_in,
+                couple_in,
+                axes_in,
+                point_in,
+                gap_in,
+                multiplier_in,
+                contact_pair_out,
+                contact_point_out,
+                contact_normal_out,
+                contact_load_out,
+                contact_gap_out,
+            )
+
+    return SimpleNamespace(
+        find_path=find_path,
+        scatter_rows=scatter_rows,
+        known_gap=known_gap,
+        add_force=add_force,
+        write_contacts=write_contacts,
+    )

@@ -55,7 +55,7 @@ struct Strip {
         #pragma clang fp contract(fast)
         const int width = end - first;
         const lane_t* base[WIDTH];
-        lane_t z[9 * WIDTH];
+        alignas(64) lane_t z[9 * WIDTH];
         for (int j = 0; j < width; ++j) {
             lane_t* const x = y + 9 * on_path[first + j];
             MINUS(x, j, l + 9 * (start[first + c] + j - c - 1), z + 9 * c, 3, 1)
@@ -210,6 +210,18 @@ struct Products {
     const int* places(int contact) const { return place + (long)contact * size; }
     lane_t* block(int c, int d) const { return out + (long)(row_count + 3 * c) * order + row_count + 3 * d; }
 
+    static void add(lane_t* t, lane_t* u, lane_t* v, const lane_t* a, const lane_t* b, int rows) {
+        #pragma clang fp contract(fast)
+        lane_t s0 = t[0], s1 = t[1], s2 = t[2], s3 = u[0], s4 = u[1], s5 = u[2], s6 = v[0], s7 = v[1], s8 = v[2];
+        for (int k = 0; k < rows; ++k, a += 9, b += 9)
+            for (int r = 0; r < 9; r += 3) {
+                s0 += a[r] * b[r]; s1 += a[r] * b[r + 1]; s2 += a[r] * b[r + 2];
+                s3 += a[r + 1] * b[r]; s4 += a[r + 1] * b[r + 1]; s5 += a[r + 1] * b[r + 2];
+                s6 += a[r + 2] * b[r]; s7 += a[r + 2] * b[r + 1]; s8 += a[r + 2] * b[r + 2];
+            }
+        t[0] = s0; t[1] = s1; t[2] = s2; u[0] = s3; u[1] = s4; u[2] = s5; v[0] = s6; v[1] = s7; v[2] = s8;
+    }
+
     void single(int c, int low) const {
         #pragma clang fp contract(fast)
         const int* const mine = path + (long)c * path_limit;
@@ -219,22 +231,22 @@ struct Products {
             if (mine[middle] < low) first = middle + 1; else end = middle;
         }
         const int limit = path_size[c];
+        for (end = first; end < limit && mine[end] < low + SPAN; ++end);
+        if (first == end) return;
+        const int row = mine[first], rows = end - first;
+        const bool is_run = mine[end - 1] - row == rows - 1;
+        const lane_t* const a = y + 9 * (c * path_limit + first);
         for (int d = 0; d <= c; ++d) {
             const int* const theirs = places(d);
             lane_t *const t = block(c, d), *const u = t + order, *const v = u + order;
-            lane_t s0 = t[0], s1 = t[1], s2 = t[2], s3 = u[0], s4 = u[1], s5 = u[2], s6 = v[0], s7 = v[1], s8 = v[2];
-            for (int k = first; k < limit && mine[k] < low + SPAN; ++k) {
-                const int other = theirs[mine[k]];
-                if (other < 0) continue;
-                const lane_t* const a = y + 9 * (c * path_limit + k);
-                const lane_t* const b = y + 9 * (d * path_limit + other);
-                for (int r = 0; r < 9; r += 3) {
-                    s0 += a[r] * b[r]; s1 += a[r] * b[r + 1]; s2 += a[r] * b[r + 2];
-                    s3 += a[r + 1] * b[r]; s4 += a[r + 1] * b[r + 1]; s5 += a[r + 1] * b[r + 2];
-                    s6 += a[r + 2] * b[r]; s7 += a[r + 2] * b[r + 1]; s8 += a[r + 2] * b[r + 2];
-                }
+            if (is_run && theirs[row] >= 0 && theirs[row + rows - 1] - theirs[row] == rows - 1) {
+                add(t, u, v, a, y + 9 * (d * path_limit + theirs[row]), rows);
+                continue;
             }
-            t[0] = s0; t[1] = s1; t[2] = s2; u[0] = s3; u[1] = s4; u[2] = s5; v[0] = s6; v[1] = s7; v[2] = s8;
+            for (int k = first; k < end; ++k) {
+                const int other = theirs[mine[k]];
+                if (other >= 0) add(t, u, v, y + 9 * (c * path_limit + k), y + 9 * (d * path_limit + other), 1);
+            }
         }
     }
 

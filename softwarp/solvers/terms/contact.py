@@ -7,6 +7,7 @@ import warp as wp
 
 from softwarp.kernels.collision import output
 from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
+from softwarp.kernels.rows import contact_lanes
 from softwarp.model.codes import SLOTS
 from softwarp.model.contact import ContactModel
 from softwarp.solvers.collision.detector import Detector, PairParameters
@@ -116,10 +117,15 @@ class ContactTerm(Term):
         s, c, state, d, flag = self.shard, self.contacts, self.shard.state, self.detector, self.shard.work.flag
         d.remember()
         d.store(flag, state.contact_count, state.contact_key, state.contact_force)
-        inputs = [self.sign, s.lanes, flag.real, c.count.real, c.pair.real, d.couple.real]
+        inputs = [flag.real, c.count.real, c.pair.real, d.couple.real]
         inputs += [c.axes.real, c.point.real, c.gap.real, c.multiplier.real]
         outputs = [state.contact_pair, state.contact_point, state.contact_normal, state.contact_load]
-        s.each_real(self.k.write_contacts, self.model.capacity, inputs, [*outputs, state.contact_gap])
+        outputs.append(state.contact_gap)
+        if s.variant.lanes > 1:
+            kernel = contact_lanes.kernels().write_contacts
+            wp.launch(kernel, dim=d.packs, inputs=[self.sign, *inputs], outputs=outputs, device=s.device)
+        else:
+            s.each_real(self.k.write_contacts, self.model.capacity, [self.sign, s.lanes, *inputs], outputs)
         dim = (s.world_count, self.model.count)
         inputs = [state.contact_pair, state.contact_load]
         wp.launch(self.k.sum_pairs, dim=dim, inputs=inputs, outputs=[state.pair_force], device=s.device)
