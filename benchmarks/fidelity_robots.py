@@ -25,7 +25,7 @@ from softwarp.envs.options.trunk import TrunkSceneConfig
 from softwarp.envs.scenes.catch_the_object import add_pad, build_catch_scene
 from softwarp.envs.scenes.diamond import EFFECTOR, build_diamond_scene, diamond_mesh
 from softwarp.envs.scenes.gripper import build_gripper_scene
-from softwarp.envs.scenes.tripod import build_tripod_scene, tripod_mesh
+from softwarp.envs.scenes.tripod import SERVOS, build_tripod_scene, held_nodes, tripod_mesh
 from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
 from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.finger_geometry import FLANGE
@@ -125,7 +125,10 @@ def _diamond(options: Options) -> tuple[Floats, Floats]:
 def _tripod(options: Options) -> tuple[Floats, Floats]:
     config = TripodSceneConfig(**options)
     mesh = tripod_mesh(config)
-    held = lambda x: np.linalg.norm(x[:, :2], axis=1) > 0.05  # noqa: E731
+
+    def held(x: Floats) -> NDArray[np.bool_]:
+        return np.isin(np.arange(len(x)), np.concatenate([held_nodes(config, x, servo) for servo in range(SERVOS)]))
+
     gravity = ((0.0, 0.0, -20.0), (0.0, 0.0, 20.0), (20.0, 0.0, -20.0))
     point = (0.0, 0.0, float(mesh.nodes[:, 2].max()))
     return weighed(mesh, config, config.total_mass, held, point, gravity)

@@ -42,7 +42,7 @@ def add_cable(
     points = checks.array(waypoints, f"{label}: waypoints", (None, 3), need="be finite with shape (p, 3)")
     anchor = None if pull_point is None else vector(pull_point, f"{label}: pull_point")
     carriers = _carriers(scene, body, len(points), label)
-    shared = _checked_patches(scene, carriers, points, patches or {}, label)
+    shared = _checked_patches(scene, carriers, points, {} if patches is None else patches, label)
     if pull_on is not None:
         if anchor is None:
             raise ValueError(f"{label}: pull_on needs a pull_point, the place [m] that part {pull_on!r} carries")
@@ -124,6 +124,8 @@ def _checked_patches(
             twice, more than four, shares that are none or do not add up to 1, and a waypoint that is not their mean.
     """
     checked = {}
+    if not isinstance(patches, Mapping):
+        raise ValueError(checks.refusal(f"{label}: patches", "map waypoints to nodes and their shares", patches))
     for i, patch in patches.items():
         if i not in range(len(points)) or not isinstance(carriers[i], SoftBody):
             raise ValueError(f"{label}: patches: {i!r} must be the number of a waypoint that a soft body carries")
