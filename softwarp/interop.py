@@ -146,6 +146,26 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
+@contextmanager
+def single_thread(device: str) -> Iterator[None]:
+    """Torch works in the calling thread alone meanwhile, on a CPU.
+
+    Its other threads go on looking for work for milliseconds after each small operation, on the cores that step worlds
+    next; and where something else has a core, every operation waits for it.
+    """
+    import torch
+
+    count = torch.get_num_threads()
+    if count == 1 or wp.get_device(device).is_cuda:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+
+
 def records(device: str) -> bool:
     """Whether launches may be recorded and replayed: not on a CPU in Warp's debug mode, whose replays crash.
 

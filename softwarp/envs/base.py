@@ -362,8 +362,9 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
 
     def _advance(self, action: Tensor) -> Tensor:
         """Simulate one action in all worlds and update the buffers; reward (world, 1)."""
-        self._simulate(action)
-        return self._account(action)
+        with interop.single_thread(self.sim.device):
+            self._simulate(action)
+            return self._account(action)
 
     def _account(self, action: Tensor) -> Tensor:
         """Update the buffers after an action's sub-steps; reward (world, 1)."""

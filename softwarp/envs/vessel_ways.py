@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from softwarp.envs.sums import in_order
 from softwarp.meshing import VesselTree
 
 _FAR = 1.0e3  # m, where points stand that only fill up a row
@@ -40,6 +41,7 @@ class VesselWays:
             return torch.tensor(np.stack(full), dtype=dtype, device=device)
 
         self.points = table([tree.points for tree in trees], _FAR, torch.float32)  # (vessel, point, 3)
+        self.axes = self.points.permute(2, 0, 1).contiguous()  # the same by coordinate
         self.direction = table([tree.direction for tree in trees], 0.0, torch.float32)
         self.radius = table([tree.radius for tree in trees], 0.0, torch.float32)  # m, of the lumen, (vessel, point)
         # Ways, whether a step along the vessel makes them shorter, and points ahead: (vessel, point, outlet, ...)
@@ -63,8 +65,9 @@ class VesselWays:
             vessel: Vessel of every world, int64 (world,).
             place: In the vessel's frame [m], (world, 3).
         """
-        x, y, z = (self.points[vessel] - place[:, None]).unbind(dim=2)
-        point = (x * x + y * y + z * z).argmin(dim=1)
+        rows = (axis if len(axis) == 1 else axis[vessel] for axis in self.axes)
+        square = in_order((row - at[:, None]).square_() for row, at in zip(rows, place.unbind(dim=1), strict=True))
+        point = square.argmin(dim=1)
         away = place - self.points[vessel, point]
         u = self.direction[vessel, point]
         beyond = away[:, 0] * u[:, 0] + away[:, 1] * u[:, 1] + away[:, 2] * u[:, 2]

@@ -299,3 +299,19 @@ def test_gpu_is_refused_after_a_fork(monkeypatch: pytest.MonkeyPatch) -> None:
         threads.check_gpu("cuda:0")
     monkeypatch.setattr(threads, "_is_inherited", False)
     threads.check_gpu("cuda:0")
+
+
+def test_environments_step_beside_no_threads_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that wait for work would take the cores that worlds are stepped on; the caller has his number again."""
+    count, told = torch.get_num_threads(), []
+    env = registry.make("CartStem", num_worlds=2, seed=1)
+    env.reset()
+    measure = env.measure_distance
+    monkeypatch.setattr(env, "measure_distance", lambda: (told.append(torch.get_num_threads()), measure())[1])
+    torch.set_num_threads(2)
+    try:
+        env.step(env.rand_action())
+        assert set(told) == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(count)
