@@ -32,6 +32,7 @@ PRESSED = 400  # states whose contact forces modes for contact come from
 SMALL = 0.5  # of a mode's root mean square in the motion: what is added of it to see its stiffness
 HALVINGS = 12
 SOFTEST = 1e-9  # of the largest stiffness: softer combinations of modes are rigid
+TORQUES = 10.0  # how much more a torque per weight and length counts than an amplitude per that of the state
 
 
 def train(
@@ -127,10 +128,17 @@ def train(
     away = unseen.positions[:, nodes].astype(np.float64) - rest
     with _kept(sim):
         forces = _Forces(elements_of(sim, number, nodes), basis)
+        stands = frame == "fixed" and not held.any()
+        moment = _weight(sim, mass) * float(np.ptp(rest, axis=0).max()) if stands else 0.0
         tets, thin = forces.contributions(_states(forces, _amplitudes(basis, mass, chosen), seed))
+        if moment:
+            turning = forces.torques(_amplitudes(basis, mass, chosen), mass, TORQUES / moment)
+            tets = np.concatenate([tets, turning[0]])
+            thin = {k: np.concatenate([part, more]) for (k, part), more in zip(thin.items(), turning[1:], strict=True)}
         sampled = {"tets": _sample(tets, element_tolerance, "tets")}
         sampled |= {name: _sample(part, membrane_tolerance, f"membrane {name!r}") for name, part in thin.items()}
         unseen_residuals = _unseen(forces, sampled, _amplitudes(basis, mass, away[:states]))
+        unseen_torques = _torques(forces, sampled, _amplitudes(basis, mass, away[:states]), mass, moment)
     report: dict[str, Any] = {
         "snapshots": len(motion),
         "states": len(chosen),
@@ -140,6 +148,7 @@ def train(
         "unseen_motion": float(np.linalg.norm(away, axis=-1).mean()),
         "residuals": {name: part.residual for name, part in sampled.items()},
         "unseen_residuals": unseen_residuals,
+        "unseen_torques": unseen_torques,
     }
     return Reduction(
         name=model.body_names[number],
@@ -204,6 +213,11 @@ def _seen_by_steps(sim: Simulation, number: int, mass: FloatArray, K: Any) -> An
     damping = float(sim.params.rayleigh_stiffness[0, number])
     scale = sim.dt * (sim.dt + damping)
     return ((diags_array(np.repeat(mass, 3)) + scale * K) / mass.sum()).tocsr()
+
+
+def _weight(sim: Simulation, mass: FloatArray) -> float:
+    """Weight of a body in the first world [N]."""
+    return float(mass.sum() * np.linalg.norm(sim.params.gravity[0].double().cpu().numpy()))
 
 
 @contextmanager
@@ -352,6 +366,29 @@ class _Forces:
         notices.progress_ends()
         return found[0], dict(zip(self.elements.thin, found[1:], strict=True))
 
+    def torques(self, q: FloatArray, mass: FloatArray, scale: float = 1.0) -> list[FloatArray]:
+        """Torques [N m] of the elements of every kind about the centre of mass, as far as the modes can turn the body.
+
+        A turning leaves every element as it is, but modes hold only so much of one: of what they turn along with it
+        elements have torques, whose sum is that of all of them, and small beside each.
+
+        Args:
+            q: Amplitudes, (state, mode).
+            mass: Of the nodes [kg].
+            scale: Factor, beside one that makes squares of all states a mean.
+
+        Returns:
+            (3 state, element) of every kind.
+        """
+        share = mass / mass.sum()
+        found: list[list[FloatArray]] = [[] for _ in self.tables]
+        for x, parts in zip(self._moved(q), self._on_modes(q), strict=True):
+            turned = np.array([np.cross(axis, x - share @ x) for axis in np.eye(3)])
+            onto = _amplitudes(self.basis, mass, turned) * (scale / np.sqrt(len(q)))
+            for rows, part in zip(found, parts, strict=True):
+                rows.append(onto @ part)
+        return [np.concatenate(rows) for rows in found]
+
     def _moved(self, q: FloatArray) -> FloatArray:
         """Nodes at some amplitudes [m], (state, node, 3)."""
         moved: FloatArray = np.einsum("sk,knc->snc", q, self.basis.modes, optimize=True) + self.elements.at_rest
@@ -422,4 +459,17 @@ def _unseen(forces: _Forces, sampled: Mapping[str, Sampling], q: FloatArray) -> 
     return {
         name: float(np.linalg.norm(part @ (sampled[name].weight - 1.0)))
         for name, part in {"tets": tets, **thin}.items()
+    }
+
+
+def _torques(
+    forces: _Forces, sampled: Mapping[str, Sampling], q: FloatArray, mass: FloatArray, moment: float
+) -> dict[str, float]:
+    """Errors of the chosen elements' torques, per weight and length, at states that they were not chosen by."""
+    if not moment:
+        return {}
+    parts = forces.torques(q, mass, 1.0 / moment)
+    return {
+        name: float(np.linalg.norm(part @ (found.weight - 1.0)))
+        for (name, found), part in zip(sampled.items(), parts, strict=True)
     }
