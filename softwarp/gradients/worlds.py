@@ -384,7 +384,7 @@ def _adjoint(
     if isinstance(steps, SecondOrder):
         return SecondOrderAdjoint(steps, gradients, index)
     if steps.control is not None:
-        return NewtonAdjoint(steps, gradients, index)
+        return NewtonAdjoint(steps, gradients, index, rest=rest)
     if steps.system.model.joints is not None:
         return JointStepAdjoint(steps.system, steps.h, gradients, index)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint

@@ -488,8 +488,10 @@ class StepAdjoint:
         """Gradients by the rest shape; needs those by the corners of elements."""
         s, m = self.shard, self.model
         if self.tets is not None:
-            self.tets.pull_rest(self.node_v, self.node_p, self.stiffness, self.h, self.corner, rest)
+            felt = (self.node_v, self.element_v, self.node_p, self.stiffness)
+            self.tets.pull_rest(*felt, self.h, self.corner, rest)
         inputs = [s.lanes, m.corner_start, m.corner, rest.real]
         s.each_real(self.k.rest_nodes, m.node_count, inputs, [self.gradients.rest_x])
         outputs = [self.gradients.cable_rest_length]
-        s.each_real(self.k_rows.rest_lengths, m.cable_count, [s.lanes, self.measured.real], outputs)
+        inputs = [s.lanes, self.is_stage, self.measured.real, self.start.real]
+        s.each_real(self.k_rows.rest_lengths, m.cable_count, inputs, outputs)
