@@ -22,7 +22,7 @@ Tensors = Mapping[str, torch.Tensor]
 GROUPS = {"state": "state", "controls": "control", "parameters": "params"}  # arguments, and how a call names them
 STARTS = (
     *("node_x", "node_v", "cavity_pressure", "body_pose", "body_twist"),
-    *("rod_x", "rod_q", "rod_v", "rod_w", "mode_q", "mode_v"),
+    *("rod_x", "rod_q", "rod_v", "rod_w", "mode_q", "mode_v", "mode_turn"),
 )
 
 
@@ -45,6 +45,7 @@ class States:
         body_twist: Their velocities [m/s] and angular velocities [rad/s], (state, world, body, 6).
         mode_q: Amplitudes [m] of the modes of reduced bodies, (state, world, mode).
         mode_v: Their velocities [m/s], likewise.
+        mode_turn: Quaternions of floating frames, (state, world, frame, 4).
     """
 
     step: torch.Tensor
@@ -61,6 +62,7 @@ class States:
     body_twist: torch.Tensor
     mode_q: torch.Tensor
     mode_v: torch.Tensor
+    mode_turn: torch.Tensor
 
 
 class Rollout:
@@ -88,8 +90,6 @@ class Rollout:
         require_differentiable(sim)
         if rest and sim.options.integrator != "euler":
             raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
-        if rest and sim.options.newton_iterations > 1:
-            raise ValueError("gradients.Rollout: rest shapes have gradients with newton_iterations=1 only")
         if rest and sim.model.has_moving_frames:
             told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
@@ -128,6 +128,7 @@ class Rollout:
                 chamber), which matters where a rate or a flow bounds a command and in the tangent of pressures;
                 ``rod_x`` [m], ``rod_q``, ``rod_v`` [m/s] and ``rod_w`` [rad/s] of the nodes of rods;
                 ``mode_q`` [m] and ``mode_v`` [m/s], each (world, mode), of reduced bodies, whose nodes follow;
+                ``mode_turn``, quaternions of floating frames, (world, frame, 4);
                 ``body_pose`` and ``body_twist`` of rigid bodies. Those of the simulation where left out.
             controls: ``node_force`` [N], ``rod_force`` and ``body_force`` [N] with moments [N m], ``body_velocity``
                 [m/s] with spins [rad/s] of kinematic bodies that carry something, ``joint_target`` [m, rad],
@@ -224,6 +225,7 @@ class Rollout:
         parts = {name: value[..., : model.rigid_count, :] for name, value in bodies.items()}
         modes = dict(zip(self.worlds.names, kept, strict=True))
         parts |= {name: modes.get(name, x.new_empty((*x.shape[:-2], 0))) for name in MODES}
+        parts["mode_turn"] = modes.get("mode_turn", x.new_empty((*x.shape[:-2], 0, 4)))
         parts |= {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
         marked = self._markers(x, frames["frame_pose"] if model.has_moving_frames else None)
         return States(step, x, v, tension, pressure, marked, **parts)

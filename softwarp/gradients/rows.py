@@ -7,14 +7,17 @@ have a tangent of their own, ``solvers.directional``. Theory: docs/theory/adjoin
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
 import torch
 
+from softwarp.model.floating import RIGID, FloatingModel
 from softwarp.model.gradients import FRAMES, PARAMETERS
 from softwarp.model.model import Model
+from softwarp.model.reduction import ReductionModel
 from softwarp.simulation import Simulation
 
 Slopes = dict[str, torch.Tensor]
@@ -28,6 +31,7 @@ class Worlds(Protocol):
     h: float
     arrays: tuple[str, ...]
     names: Sequence[str]
+    state: Slopes
     gradients: Slopes
 
     @property
@@ -82,7 +86,8 @@ class Shapes:
         modes = np.zeros((len(node), 3, r.count))
         for i, (k, at) in enumerate(zip(body, start, strict=True)):
             first, end = r.start[k], r.start[k + 1]
-            modes[i, :, first:end] = basis[at : at + 3 * r.stride[k]].reshape(3, -1)[:, : end - first]
+            skip = 0 if r.floating is None else RIGID * int(k in r.floating.number.numpy())  # rigid modes come apart
+            modes[i, :, first + skip : end] = basis[at : at + 3 * r.stride[k]].reshape(3, -1)[:, skip : end - first]
         self.node, self._modes = torch.as_tensor(node, device=like.device).long(), torch.as_tensor(modes).to(like)
 
     def __call__(self, amplitudes: torch.Tensor) -> torch.Tensor:
@@ -91,6 +96,57 @@ class Shapes:
         for mode in range(1, self._modes.shape[-1]):
             total += amplitudes[..., mode, None, None] * self._modes[..., mode]
         return total
+
+
+class FrameSlopes:
+    """Nodes of bodies with a floating frame, along directions.
+
+    Args:
+        modes: Reduced bodies.
+        model: Those with such a frame.
+        like: Precision and device.
+    """
+
+    def __init__(self, modes: ReductionModel, model: FloatingModel, like: torch.Tensor) -> None:
+        start, listed, node = (part.numpy() for part in (model.listed_start, model.listed, modes.node))
+        self.first, self.radius = model.first.numpy().tolist(), model.radius.numpy().tolist()
+        self._node = [
+            torch.as_tensor(node[listed[a:b]], device=like.device).long() for a, b in itertools.pairwise(start.tolist())
+        ]
+        self._centre = torch.as_tensor(model.centre.numpy()).to(like)
+
+    def turn(self, state: Slopes, found: Slopes) -> None:
+        """Slopes of nodes, (direction, world, node, 3), from those of frames and what modes add in their axes."""
+        for f, node in enumerate(self._node):
+            q, rate = state["mode_turn"][:, f], found["mode_turn"][:, :, f]
+            imaginary = (
+                q[:, 3:] * rate[..., :3]
+                - rate[..., 3:] * q[:, :3]
+                + torch.linalg.cross(q[:, :3].expand_as(rate[..., :3]), rate[..., :3])
+            )
+            turned = 2.0 * imaginary[:, :, None]  # of q' q*, twice
+            along, about = slice(self.first[f], self.first[f] + 3), slice(self.first[f] + 3, self.first[f] + 6)
+            V, spin = state["mode_v"][:, None, along], state["mode_v"][:, None, about] / self.radius[f]
+            r = state["node_x"][:, node] - (self._centre[f] + state["mode_q"][:, along])[:, None]
+            u = state["node_v"][:, node] - V - _cross(spin, r)
+            by_spin = found["mode_v"][:, :, None, about] / self.radius[f]
+            arm = _cross(turned, r) + _rotated(q[:, None], found["node_x"][:, :, node])
+            found["node_x"][:, :, node] = found["mode_q"][:, :, None, along] + arm
+            own = _cross(turned, u) + _rotated(q[:, None], found["node_v"][:, :, node])
+            own += _cross(by_spin, r) + _cross(spin, arm)
+            found["node_v"][:, :, node] = found["mode_v"][:, :, None, along] + own
+
+
+def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    a, b = torch.broadcast_tensors(a, b)
+    found: torch.Tensor = torch.linalg.cross(a, b)
+    return found
+
+
+def _rotated(q: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """Vectors turned by unit quaternions."""
+    t = 2.0 * _cross(q[..., :3], x)
+    return x + q[..., 3:] * t + _cross(q[..., :3], t)
 
 
 class RowDirections:
@@ -112,7 +168,10 @@ class RowDirections:
             self._follows |= (carrier < 0).to(device)
         self._moves = torch.as_tensor(places[:count] >= 0).to(device)
         self._shapes = None if model.reduction is None else Shapes(model, worlds.gradients["node_x"])
+        self._frames: FrameSlopes | None = None
         if self._shapes is not None:
+            if model.reduction is not None and model.reduction.floating is not None:
+                self._frames = FrameSlopes(model.reduction, model.reduction.floating, worlds.gradients["node_x"])
             self._follows[self._shapes.node] = True
             self._moves[self._shapes.node] = False
 
@@ -147,11 +206,14 @@ class RowDirections:
         before = held["node_x"].reshape(x.shape) if "node_x" in held else torch.zeros_like(x)
         found["node_x"] = torch.where(self._follows[:, None], before + worlds.h * v, x)
         if self._shapes is not None:
-            found["mode_q"] = worlds.h * found["mode_v"]
-            if "mode_q" in held:
-                found["mode_q"] += held["mode_q"].reshape(found["mode_q"].shape)
+            if self._frames is None:
+                found["mode_q"] = worlds.h * found["mode_v"]
+                if "mode_q" in held:
+                    found["mode_q"] += held["mode_q"].reshape(found["mode_q"].shape)
             for nodes, modes in (("node_x", "mode_q"), ("node_v", "mode_v")):
                 found[nodes][..., self._shapes.node, :] = self._shapes(found[modes])
+            if self._frames is not None:
+                self._frames.turn(worlds.state, found)
         return [{name: values[number] for name, values in found.items()} for number in range(len(slopes))]
 
     def _stacked(self, slopes: Sequence[Slopes]) -> Slopes:
@@ -179,8 +241,8 @@ class RowDirections:
                 counts &= ~self._follows[:, None]
             elif name == "node_v":
                 counts &= (self._moves | ~self._follows)[:, None]
-            elif name == "mode_q":  # follow from their velocities
-                counts[:] = False
+            elif name == "mode_q":  # follow from their velocities, but for momentum that frames have turned
+                counts[:] = self._frames is not None
             elif name in FRAMES:  # centres of mass follow from their bodies, and nobody asks for them
                 counts[self.worlds.model.rigid_count + self.worlds.model.rod_node_count :] = False
             for row in counts.flatten().nonzero().flatten().tolist():

@@ -10,7 +10,18 @@ import warp as wp
 from softwarp import interop
 from softwarp.gradients.rows import RowDirections
 from softwarp.model.codes import Status
-from softwarp.model.gradients import CONTACT, FRAMES, JOINT_MEMORY, JOINTS, KINEMATIC, MEMORIES, MODES, STATE, Gradients
+from softwarp.model.gradients import (
+    CONTACT,
+    FLOATING,
+    FRAMES,
+    JOINT_MEMORY,
+    JOINTS,
+    KINEMATIC,
+    MEMORIES,
+    MODES,
+    STATE,
+    Gradients,
+)
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, worlds_slice
 from softwarp.simulation import Simulation
@@ -191,6 +202,8 @@ class DifferentiableWorlds:
             self.names = (*self.names, *MEMORIES)
         if model.reduction is not None:
             self.names = (*self.names, *MODES)
+            if model.reduction.floating is not None:
+                self.names = (*self.names, *FLOATING)
         self.memory = tuple(name for name in memory if name not in self.names)
         self._index = index = AdjointIndex.of(model)
         self._twins = twins = sim.make_twins(*room.worlds)
@@ -384,7 +397,7 @@ def _adjoint(
     if isinstance(steps, SecondOrder):
         return SecondOrderAdjoint(steps, gradients, index)
     if steps.control is not None:
-        return NewtonAdjoint(steps, gradients, index)
+        return NewtonAdjoint(steps, gradients, index, rest=rest)
     if steps.system.model.joints is not None:
         return JointStepAdjoint(steps.system, steps.h, gradients, index)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint

@@ -23,6 +23,9 @@ class Gradients:
     frame_twist: wp.array = batched("frame", width=6, unit="m/s", doc="by velocity and spin [rad/s]")
     mode_q: wp.array = batched("mode", unit="m", doc="by the amplitude of a mode of a reduced body")
     mode_v: wp.array = batched("mode", unit="m/s", doc="by its velocity")
+    mode_turn: wp.array = batched(
+        "floating", width=4, doc="by the quaternion of a floating frame, along which it turns"
+    )
     node_memory: wp.array = batched("relaxing node", width=3, unit="m", doc="by what stretches Maxwell branches")
     frame_memory: wp.array = batched("relaxing frame", width=6, unit="m", doc="likewise, and of turning [rad]")
     joint_reference: wp.array = batched("joint", unit="m", doc="by the position [rad] that a servo steers to")
@@ -71,6 +74,7 @@ class Gradients:
 
 STATE = ("node_x", "node_v", "cable_tension", "cavity_pressure")
 FRAMES = ("frame_pose", "frame_twist")  # of the state too, where there are rods
+FLOATING = ("mode_turn",)  # where some of them have floating frames
 MODES = ("mode_q", "mode_v")  # where there are reduced bodies, whose nodes follow them
 MEMORIES = ("node_memory", "frame_memory")  # where there are Maxwell branches
 JOINTS = ("joint_reference",)  # where there are joints

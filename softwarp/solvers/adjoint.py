@@ -142,8 +142,9 @@ class StepAdjoint:
     def prepare(self, *, without: tuple[str, ...] = ()) -> None:
         """All that ``pull`` needs of a step but its ``solution``, and but for some inputs by name."""
         lifts = self.frames is not None and self.frames.lifts
-        self._load(() if lifts else without)
-        if lifts:
+        turns = self.modes is not None and self.modes.frames is not None
+        self._load(() if lifts or turns else without)
+        if lifts or turns:
             self._stiffen()
 
     def _stiffen(self) -> None:
@@ -156,6 +157,9 @@ class StepAdjoint:
                 term.points.stiffness()
             elif isinstance(term, MembraneTerm):
                 term.stiffness()
+        for term in self.system.terms:
+            if isinstance(term, ReductionTerm) and term.frames is not None:
+                term.sample()
 
     def _find_forces(self) -> None:
         self.system.forces()
@@ -225,6 +229,8 @@ class StepAdjoint:
             self.contact.to_state(self.p)
         if self.modes is not None:
             self.modes.take()
+            if self.modes.frames is not None:
+                self.modes.frames.finish()
 
     def _find(self) -> None:
         """p and q of the seed and of the gradients by forces."""
@@ -407,12 +413,16 @@ class StepAdjoint:
         if self.frames is not None:
             self.frames.lift(self.element_v, self.node_p)
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
-        if self.tets is not None:
+        frames = None if self.modes is None else self.modes.frames
+        if frames is not None:
+            nodal = (self.node_v, self.node_p, self.p, self.corner)
+            frames.pull(self.tets, self.skin, *nodal, parameters=parameters)
+        elif self.tets is not None:
             self.tets.pull(*elements, parameters=parameters)
         if self.quadratic is not None:
             self.quadratic.pull(*elements, parameters=parameters)
             self.quadratic.add_mass(self.p, self.node_mass_p)
-        if self.skin is not None:
+        if self.skin is not None and frames is None:
             self.skin.pull(*elements)
         if not m.row_count:
             return
@@ -446,6 +456,8 @@ class StepAdjoint:
         s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
         if self.modes is not None:
             self.modes.to_state()
+            if self.modes.frames is not None:
+                self.modes.frames.to_state(self.index, self.p, self.q, self.corner)
         self._to_tractions()
 
     def _to_tractions(self) -> None:
@@ -488,8 +500,10 @@ class StepAdjoint:
         """Gradients by the rest shape; needs those by the corners of elements."""
         s, m = self.shard, self.model
         if self.tets is not None:
-            self.tets.pull_rest(self.node_v, self.node_p, self.stiffness, self.h, self.corner, rest)
+            felt = (self.node_v, self.element_v, self.node_p, self.stiffness)
+            self.tets.pull_rest(*felt, self.h, self.corner, rest)
         inputs = [s.lanes, m.corner_start, m.corner, rest.real]
         s.each_real(self.k.rest_nodes, m.node_count, inputs, [self.gradients.rest_x])
         outputs = [self.gradients.cable_rest_length]
-        s.each_real(self.k_rows.rest_lengths, m.cable_count, [s.lanes, self.measured.real], outputs)
+        inputs = [s.lanes, self.is_stage, self.measured.real, self.start.real]
+        s.each_real(self.k_rows.rest_lengths, m.cable_count, inputs, outputs)

@@ -7,13 +7,14 @@ import warp as wp
 from softwarp.kernels.elements import mode_adjoint, mode_loads, reduction
 from softwarp.model.gradients import Gradients
 from softwarp.model.reduction import ReductionModel
+from softwarp.solvers.floating_adjoint import FloatingAdjoint
 from softwarp.solvers.terms.reduction import ReductionTerm
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
 
 class ModeAdjoint:
-    """Modes of the reduced bodies of one shard, in a fixed frame.
+    """Modes of the reduced bodies of one shard.
 
     Args:
         shard: Worlds.
@@ -33,26 +34,39 @@ class ModeAdjoint:
         self.mass_p = shard.rows(m.count)
         self.start = wp.array(m.start, dtype=wp.int32, device=shard.device)
         self.at_zero = wp.zeros_like(m.node_rest)
+        self.listed_v = shard.rows(3 * int(m.node.size))
+        self.frames = None if m.floating is None else FloatingAdjoint(shard, term, h, gradients)
 
-    def take(self) -> None:
-        """Gradients by nodes become those by modes that they follow from."""
-        g = self.gradients
-        for by_nodes, by_modes in ((g.node_x, g.mode_q), (g.node_v, g.mode_v)):
-            self._add(by_nodes, by_modes)
+    def take(self, *, at_end: bool = False) -> None:
+        """Gradients by nodes, at the start of a step or at its end, become those by modes that they follow from."""
+        s, m, g = self.shard, self.model, self.gradients
+        for by_nodes, listed in ((g.node_x, self.listed), (g.node_v, self.listed_v)):
+            s.each_real(self.k.take_nodes, int(m.node.size), [s.lanes, m.node], [by_nodes, listed.real])
+        if self.frames is not None:
+            if at_end:
+                self.frames.take_turns()
+            self.frames.turn_bars(self.listed, self.listed_v, at_end=at_end)
+        self._add(self.listed, g.mode_q)
+        self._add(self.listed_v, g.mode_v)
 
-    def _add(self, by_nodes: wp.array, by_modes: wp.array) -> None:
-        """by_modes += Phi' by_nodes, which become 0."""
+    def _add(self, listed: Rows, by_modes: wp.array) -> None:
+        """by_modes += Phi' by listed nodes."""
         s, m = self.shard, self.model
-        s.each_real(self.k.take_nodes, int(m.node.size), [s.lanes, m.node], [by_nodes, self.listed.real])
         self.wide.zero()
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
         items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
-        s.each(self.k_loads.add_forces, items, [*inputs, self.listed.S], [self.wide.S])
+        s.each(self.k_loads.add_forces, items, [*inputs, listed.S], [self.wide.S])
+        if self.frames is not None:
+            self.frames.rigid_bars(self.wide, by_velocities=listed is self.listed_v)
         s.each_real(self.k.add_modes, m.count, [s.lanes, m.mode_wide, self.wide.real], [by_modes])
 
     def seed(self, seed: Rows, y: Rows) -> None:
         """Right-hand sides of p, from gradients by the end of a step; those by nodes are taken over first."""
-        self.take()
+        if self.frames is not None:
+            self.frames.find_places()
+        self.take(at_end=True)
+        if self.frames is not None:
+            self.frames.turn_back()
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.mode_dof, g.mode_q, g.mode_v]
         s.each_real(self.k.seed, m.count // 3, inputs, [seed.real, y.real])
@@ -63,6 +77,8 @@ class ModeAdjoint:
         for dofs, wide in ((v, self.wide_v), (p, self.wide_p)):
             s.each(self.k_modes.widen_dofs, m.wide_count, [m.wide_mode, m.mode_dof, dofs.S], [wide.S])
         t.place_both(self.at_zero, self.wide_v, self.wide_p, node_v, node_p)
+        if self.frames is not None:
+            self.frames.place(p, node_v, node_p)
 
     def to_state(self) -> None:
         """Gradients by the velocities at the start of the step; needs ``place``."""

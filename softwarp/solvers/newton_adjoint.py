@@ -38,6 +38,7 @@ class NewtonAdjoint(StageAdjoint):
         stepper: Takes the step; its system has the state that it started from.
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
 
     Attributes:
         adrift: Not 0 in worlds whose gradient did not come to stay, until somebody clears it.
@@ -46,8 +47,10 @@ class NewtonAdjoint(StageAdjoint):
     follows = 0.0
     touches = EndContacts
 
-    def __init__(self, stepper: ImplicitEuler, gradients: Gradients, index: AdjointIndex) -> None:
-        super().__init__(stepper.system, stepper.h, stepper.pace, self._recall, gradients, index)
+    def __init__(
+        self, stepper: ImplicitEuler, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
+    ) -> None:
+        super().__init__(stepper.system, stepper.h, stepper.pace, self._recall, gradients, index, rest=rest)
         self.stepper, self.surface, s = stepper, None, self.shard
         self.k_newton = newton_adjoint.kernels(s.variant)
         self.found_v = s.rows(s.dof_room)

@@ -30,6 +30,7 @@ class StageAdjoint(StepAdjoint):
         predict: Writes the velocities that it is linearised with.
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
 
     Attributes:
         follows: 1 if it is linearised with the velocities of its start, else 0.
@@ -47,8 +48,10 @@ class StageAdjoint(StepAdjoint):
         predict: Callable[[], None],
         gradients: Gradients,
         index: AdjointIndex,
+        *,
+        rest: bool = False,
     ) -> None:
-        super().__init__(system, h, gradients, index)
+        super().__init__(system, h, gradients, index, rest=rest)
         assert self.leaning is not None
         self.start_v = self.leaning.start_v
         self.pace, self.predict = pace, predict

@@ -161,6 +161,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         node_x_in: wp.array3d(dtype=real),
         node_v0_in: wp.array3d(dtype=real),
         node_v_in: wp.array3d(dtype=real),
+        felt_v_in: wp.array3d(dtype=real),
         node_p_in: wp.array3d(dtype=real),
         corner_in: wp.array3d(dtype=real),
         h: real,
@@ -174,7 +175,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
         F = gradient_of(node_x_in, pack, lane, tet_node, tet_gradient, tet)
         X = gradient_of(node_p_in, pack, lane, tet_node, tet_gradient, tet)
-        Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)
+        Y = gradient_of(felt_v_in, pack, lane, tet_node, tet_gradient, tet)
         e = edge(node_x_in, pack, lane, tet_node, tet, 1)
         g = edge(node_x_in, pack, lane, tet_node, tet, 2)
         E = rest_edges(tet_gradient, tet)

@@ -399,8 +399,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def rest_lengths(
         lanes: int,
+        is_stage: bool,
         # Workspace in
         measured_in: wp.array3d(dtype=real),
+        start_in: wp.array3d(dtype=real),
         # State out
         length_bar_out: wp.array2d(dtype=real),
     ):
@@ -408,7 +410,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, cable, lane = wp.tid()
         world = pack * lanes + lane
         if world < length_bar_out.shape[0]:
-            length_bar_out[world, cable] = length_bar_out[world, cable] + measured_in[pack, cable, lane]
+            total = measured_in[pack, cable, lane]
+            if is_stage:
+                total += start_in[pack, cable, lane]
+            length_bar_out[world, cable] = length_bar_out[world, cable] + total
 
     return SimpleNamespace(
         rest_lengths=rest_lengths,

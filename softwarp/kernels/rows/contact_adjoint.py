@@ -253,6 +253,12 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         change_out[pack, i, lane] = change_out[pack, k, lane]
         change_out[pack, k, lane] = right
 
+    @wp.func
+    def unit_of(delassus: wp.array3d(dtype=real), pack: int, lane: int, order: int, i: int):
+        """Of one unknown, in which rows of pressures, tensions and contacts have pivots that compare."""
+        own = delassus[pack, i * order + i, lane]
+        return wp.where(own > real(0.0), real(1.0) / wp.sqrt(own), real(1.0))
+
     @wp.kernel(module=module, enable_backward=False)
     def solve(
         rows: int,
@@ -307,6 +313,16 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
             known = real(0.0)
             if i >= rows:
                 known = delassus_in[pack, i * order + i, lane] * z_out[pack, i - rows, lane]
+            largest_entry = real(0.0)
+            for j in range(total):
+                entry_in_units = matrix_out[pack, i * order + j, lane] * unit_of(delassus_in, pack, lane, order, j)
+                matrix_out[pack, i * order + j, lane] = entry_in_units
+                largest_entry = wp.max(largest_entry, wp.abs(entry_in_units))
+            if largest_entry > real(0.0):
+                for j in range(total):
+                    matrix_out[pack, i * order + j, lane] = matrix_out[pack, i * order + j, lane] / largest_entry
+                change_out[pack, i, lane] = change_out[pack, i, lane] / largest_entry
+                known = known / largest_entry
             scale = wp.max(scale, wp.max(wp.abs(change_out[pack, i, lane]), wp.abs(known)))
         rank = int(0)  # rows that have a pivot, each in its column; a column without one repeats those before it
         for k in range(total):
@@ -315,7 +331,7 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 if wp.abs(matrix_out[pack, i * order + k, lane]) > wp.abs(matrix_out[pack, largest * order + k, lane]):
                     largest = i
             pivot = matrix_out[pack, largest * order + k, lane]
-            if wp.abs(pivot) > real(wp.static(dependent)) * delassus_in[pack, k * order + k, lane]:
+            if wp.abs(pivot) > real(wp.static(dependent)):
                 if largest != rank:
                     swap(matrix_out, change_out, pack, lane, order, total, largest, rank, k)
                 for i in range(rank + 1, total):
@@ -343,6 +359,9 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 for j in range(i + 1, total):
                     value -= matrix_out[pack, rank * order + j, lane] * change_out[pack, j, lane]
                 value = value / matrix_out[pack, rank * order + i, lane]
+            change_out[pack, i, lane] = value
+        for i in range(total):
+            value = change_out[pack, i, lane] * unit_of(delassus_in, pack, lane, order, i)
             change_out[pack, i, lane] = value
             if i < rows:
                 q_out[pack, i, lane] = q_out[pack, i, lane] + value

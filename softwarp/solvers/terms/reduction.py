@@ -65,11 +65,11 @@ class ReductionTerm(Term):
         """Blocks of A between modes."""
         s, m, w, i = self.shard, self.model, self.shard.work, self.shard.input
         if s.variant.world_fastest:
-            self._sample()
+            self.sample()
             self._gather()
         else:
             if not self.takes_stored:
-                self._sample()
+                self.sample()
             inputs = [m.chunk_room, self.takes_stored, m.body_number, m.tet_sample, m.tri_sample]
             inputs += [m.body_modes, m.body_stride, m.body_chunk, m.chunk_rows, m.chunk_basis]
             inputs += [m.chunk_tets, m.chunk_tris, m.tet_list, m.tri_list, m.chunk_modes]
@@ -82,7 +82,7 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.tangent()
 
-    def _sample(self) -> None:
+    def sample(self) -> None:
         """Stiffness of the elements that count."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.tet_sample, m.tet_turned, s.model.tet_body, w.body_mu.S, w.body_lam.S, w.body_stiffness.S]

@@ -99,10 +99,8 @@ def test_steps_that_are_not_solved_are_refused() -> None:
         Rollout(sim)(given["state"], given["controls"], given["parameters"])
 
 
-def test_kept_factors_and_rest_shapes_are_refused() -> None:
-    """Neither is there yet."""
+def test_kept_factors_are_refused() -> None:
+    """They are not there yet."""
     sim = cube("nh_log", **NEWTON)
     with pytest.raises(ValueError, match="newton_iterations above 1 keeps no factors"):
         Rollout(sim)(steps=1, factors=True)
-    with pytest.raises(ValueError, match="newton_iterations=1 only"):
-        Rollout(sim, rest=True)

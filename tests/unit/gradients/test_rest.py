@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ CHANGE = 2e-7 * RNG.standard_normal(REST.shape)  # stress-free elements are a sw
 START = torch.tensor(REST + 3e-4 * RNG.standard_normal(REST.shape))[None]
 SPEED = torch.tensor(0.05 * RNG.standard_normal(REST.shape))[None]
 WEIGHT = torch.tensor(RNG.standard_normal(REST.shape))[None]
+NEWTON: dict[str, Any] = {"newton_iterations": 60, "newton_tolerance": 1e-13}
 LAWS = ["large", "nh_log", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot", "ogden"))]
 
 
@@ -40,7 +42,7 @@ SKIN_SHARES = shares(SKIN.nodes + (0.03, 0.01, 0.01))
 CABLE_SHARES = shares(np.array([(0.0, 0.01, 0.035), (0.05, 0.01, 0.035), (0.1, 0.01, 0.035)]))
 
 
-def scene(law: str, rest: np.ndarray) -> sw.Simulation:
+def scene(law: str, rest: np.ndarray, **options: Any) -> sw.Simulation:
     """A beam with a cable and a chamber, which are of its material."""
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     mesh = replace(MESH, nodes=rest)
@@ -48,7 +50,7 @@ def scene(law: str, rest: np.ndarray) -> sw.Simulation:
     builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
     builder.add_cable(body, CABLE_SHARES @ rest)
     builder.add_cavity(body, SKIN_SHARES @ rest, SKIN.surface())
-    sim = sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01)
+    sim = sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01, **options)
     sim.control.cable_displacement[...] = 0.004
     sim.control.cavity_pressure[...] = 4000.0
     return sim
@@ -63,13 +65,23 @@ def rested(law: str, rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tenso
 
 def moved(law: str, rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tensor:
     """A loss of three steps from a given start."""
-    rollout = Rollout(scene(law, rest), rest=leaf is not None)
+    return stepped(scene(law, rest), START, leaf)
+
+
+def stepped(sim: sw.Simulation, start: torch.Tensor, leaf: torch.Tensor | None) -> torch.Tensor:
+    """A loss of three steps from ``start``."""
+    rollout = Rollout(sim, rest=leaf is not None)
     parameters = None if leaf is None else {"rest_x": leaf}
-    states = rollout({"node_x": START, "node_v": SPEED}, parameters=parameters, steps=3)
+    states = rollout({"node_x": start, "node_v": SPEED}, parameters=parameters, steps=3)
     return ((states.node_x + states.node_v) * WEIGHT).sum() + 0.01 * states.cable_tension.sum()
 
 
-@pytest.mark.parametrize("loss", [rested, moved])
+def solved(law: str, rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tensor:
+    """The same of steps that Newton's method solves; from further off, where fewer tangents are about to switch."""
+    return stepped(scene(law, rest, **NEWTON), torch.tensor(REST) + 10.0 * (START - torch.tensor(REST)), leaf)
+
+
+@pytest.mark.parametrize("loss", [rested, moved, solved])
 @pytest.mark.parametrize("law", LAWS)
 def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.Tensor]) -> None:
     """Elements, masses, lengths of cables and fixed nodes all follow the rest shape."""
@@ -80,6 +92,36 @@ def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.
     values = [float(loss(law, REST + factor * CHANGE, None)) for factor in (1.0, -1.0, 2.0, -2.0)]
     expected = (8.0 * (values[0] - values[1]) - (values[2] - values[3])) / 12.0
     assert abs(derivative - expected) <= 1e-6 * abs(expected)
+
+
+@pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("beside", ["ball", "branch"])
+def test_contacts_and_memories(beside: str, newton: bool) -> None:
+    """Beside contact with a ball, and with a Maxwell branch; cables stretch."""
+    leaf = torch.tensor(REST).requires_grad_()
+    stepped(beam_beside(beside, newton, REST), START, leaf).backward()
+    assert leaf.grad is not None
+    derivative = float((leaf.grad * torch.tensor(CHANGE)).sum())
+    ahead, back = (float(stepped(beam_beside(beside, newton, REST + way * CHANGE), START, None)) for way in (1.0, -1.0))
+    assert abs(derivative - 0.5 * (ahead - back)) <= 1e-6 * abs(derivative)
+
+
+def beam_beside(beside: str, newton: bool, rest: np.ndarray) -> sw.Simulation:
+    """The beam with one elastic cable, with a memory or on a ball."""
+    builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
+    memory = (0.3, 0.05) if beside == "branch" else (0.0, 0.0)
+    mesh, stuff = replace(MESH, nodes=rest), material("large", 1e5, 0.4)
+    body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory)
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
+    builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
+    if beside == "ball":
+        ball = builder.add_rigid(sw.Sphere(0.02), kinematic=True, pose=(0.09, 0.02, -0.0195))
+        builder.add_contact(body, ball, mu=0.4)
+    found = {"gauss_seidel_iterations": 3000, "gauss_seidel_tolerance": 1e-14}
+    options = {**found, **(NEWTON if newton else {})}
+    sim = sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01, **options)
+    sim.control.cable_displacement[...] = 0.004
+    return sim
 
 
 def test_refusals() -> None:

@@ -101,14 +101,14 @@ def turned(q: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
 
 def displaced(name: str, start: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
     """An input and a change of it; of orientations, also those of poses, the change is a turn."""
-    if name == "rod_q":
+    if name in ("rod_q", "mode_turn"):
         return turned(start, change)
     if name == "body_pose":
         return torch.cat([start[..., :3] + change[..., :3], turned(start[..., 3:], change[..., 3:])], dim=-1)
     return start + change
 
 
-WIDTHS = {"rod_q": 3, "body_pose": 6}  # of changes of what has a quaternion
+WIDTHS = {"rod_q": 3, "mode_turn": 3, "body_pose": 6}  # of changes of what has a quaternion
 
 
 def loss(states: States) -> torch.Tensor:

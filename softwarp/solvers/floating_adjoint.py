@@ -1,0 +1,272 @@
+"""Floating frames of reduced bodies in the adjoint of a step. Equations: docs/theory/adjoint.md."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from softwarp.kernels.elements import adjoint as of_tets
+from softwarp.kernels.elements import adjoint_sums, floating_adjoint, floating_pull, membrane_adjoint, samples
+from softwarp.model.floating import FloatingModel
+from softwarp.model.gradients import Gradients
+from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.element_adjoint import TetAdjoint
+from softwarp.solvers.membrane_adjoint import MembraneAdjoint
+from softwarp.solvers.terms.floating import FloatingFrames
+from softwarp.solvers.terms.reduction import ReductionTerm
+from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.shard import Shard
+
+
+class Places:
+    """Bodies as they are at one end of a step: amplitudes, frames, and all listed nodes.
+
+    Args:
+        shard: Worlds.
+        term: Reduced bodies, with floating frames.
+        model: These.
+    """
+
+    def __init__(self, shard: Shard, term: ReductionTerm, model: FloatingModel) -> None:
+        self.shard, self.term, self.model = shard, term, model
+        assert term.frames is not None
+        self.frames: FloatingFrames = term.frames
+        modes, nodes, m = term.model.count, shard.model.node_count, model
+        self.q, self.v = shard.rows(modes), shard.rows(modes)
+        self.turn, self.centre = shard.rows(4 * m.count), shard.rows(3 * m.count)
+        self.wide_q, self.wide_v = shard.rows(term.model.wide_count), shard.rows(term.model.wide_count)
+        self.x, self.node_v = shard.rows(3 * nodes), shard.rows(3 * nodes)
+
+    def frame(self, x_scale: float) -> None:
+        """Frames x_scale times the velocities after the start, from amplitudes there."""
+        s, m, r = self.shard, self.model, self.term.model
+        inputs = [m.first, m.block, r.mode_dof, m.centre, m.radius]
+        inputs += [s.input["mode_turn0"].real, s.work.dof_v.real, x_scale]
+        outputs = [self.q.real, self.turn.real, self.centre.real]
+        s.each_real(self.frames.k.trial_frame, m.count, inputs, outputs)
+
+    def widen(self) -> None:
+        """Wide amplitudes, 1 of places at rest, and velocities."""
+        s, r, k = self.shard, self.term.model, self.term.k
+        for values, wide in ((self.q, self.wide_q), (self.v, self.wide_v)):
+            s.each(k.widen, r.wide_count, [r.wide_mode, values.S], [wide.S])
+        s.each_real(self.frames.k.at_rest, self.model.count, [self.model.first_wide], [self.wide_q.real])
+
+    def place(self) -> None:
+        """All listed nodes and their velocities; needs ``widen``."""
+        s, m, r, k = self.shard, self.model, self.term.model, self.frames.k
+        self.term.place_both(r.node_rest, self.wide_q, self.wide_v, self.x, self.node_v)
+        listed = [m.listed, m.listed_body, r.node]
+        inputs = [int(r.node.size), *listed, self.turn.real, self.centre.real]
+        s.each_real(k.place_nodes, int(m.listed.size), inputs, [self.x.real])
+        inputs = [*listed, m.first, m.radius, self.turn.real, self.centre.real, self.v.real, self.x.real]
+        s.each_real(k.node_velocities, int(m.listed.size), inputs, [self.node_v.real])
+
+
+class FloatingAdjoint:
+    """Floating frames of one shard.
+
+    Args:
+        shard: Worlds.
+        term: Reduced bodies, with such frames.
+        h: Step [s].
+        gradients: Arrays of these worlds.
+
+    Attributes:
+        own_v, own_p: v and p of nodes as their elements feel them without turning.
+    """
+
+    def __init__(self, shard: Shard, term: ReductionTerm, h: float, gradients: Gradients) -> None:
+        self.shard, self.term, self.h, self.gradients = shard, term, h, gradients
+        assert term.model.floating is not None
+        self.model: FloatingModel = term.model.floating
+        m, nodes = self.model, shard.model.node_count
+        self.k, self.k_pull = floating_adjoint.kernels(shard.variant), floating_pull.kernels(shard.variant)
+        self.k_sums = adjoint_sums.kernels(shard.variant)
+        self.start, self.end = Places(shard, term, m), Places(shard, term, m)
+        moments = 9 * int(m.moment_body.size)
+        self.moment, self.rate = shard.rows(moments), shard.rows(moments)
+        self.start_bar, self.end_bar, self.rate_bar = (shard.rows(moments) for _ in range(3))
+        self.q0_bar, self.q1_bar, self.nothing = (shard.rows(term.model.count) for _ in range(3))
+        self.turn_bar, self.rigid = shard.rows(3 * m.count), shard.rows(9 * m.count)
+        self.arm, self.no_arm = (shard.rows(3 * int(term.model.node.size)) for _ in range(2))
+        self.own_v, self.own_p, self.element_bar = (shard.rows(3 * nodes) for _ in range(3))
+        self.elastic, self.damped = (shard.rows(shard.model.body_count) for _ in range(2))
+        corners, points = shard.work.element_force.real.shape[1], max(len(shard.model.point_node), 1)
+        self.corner, self.no_point = shard.rows(corners), shard.rows(3 * points)
+        self.parameter: list[Rows] = []
+        self.asks = True
+
+    def find_places(self) -> None:
+        """Where all nodes were and are, and how bodies have turned on; needs the solution of the step."""
+        s, m, r, i, w = self.shard, self.model, self.term.model, self.shard.input, self.shard.work
+        start, end, k = self.start, self.end, self.start.frames.k_inertia
+        start.q.copy_from(i["mode_q0"])
+        start.v.copy_from(i["mode_v0"])
+        start.frame(0.0)
+        start.widen()
+        start.place()
+        inputs = [r.mode_dof, i["mode_q0"].S, w.dof_v.S, self.h]
+        s.each(self.term.k.trial_amplitude, r.count // 3, inputs, [end.q.S, end.v.S])
+        end.frame(self.h)
+        end.widen()
+        for wide, target in ((end.wide_q, self.moment), (end.wide_v, self.rate)):
+            inputs = [m.moment_first, m.moment_wide, m.moment_stride, m.moments, wide.S]
+            s.each(k.moments, int(m.moment_body.size), inputs, [target.S])
+        outputs = [end.v.real, end.turn.real]
+        s.each_real(k.turn_on, m.count, [*self._motion(), *self._moments(), self.h], outputs)
+        end.widen()
+        end.place()
+
+    def _motion(self) -> list[wp.array]:
+        m, i, w = self.model, self.shard.input, self.shard.work
+        inputs = [m.first, m.modes, m.block, self.term.model.mode_dof, m.moment_start, m.radius, m.volume]
+        return [*inputs, i["mode_turn0"].real, w.dof_v.real, i["mode_q0"].real, self.end.q.real]
+
+    def _moments(self) -> list[wp.array]:
+        return [self.shard.work.start_moment.real, self.moment.real, self.rate.real]
+
+    def take_turns(self) -> None:
+        """Gradients by turns at the end of the step."""
+        s, outputs = self.shard, [self.gradients.mode_turn, self.turn_bar.real]
+        s.each_real(self.k.take_turns, self.model.count, [s.lanes, self.end.turn.real], outputs)
+
+    def turn_bars(self, by_x: Rows, by_v: Rows, *, at_end: bool) -> None:
+        """Gradients by listed nodes go to the axes of their bodies; what is of the frames is kept aside."""
+        s, m, at = self.shard, self.model, self.end if at_end else self.start
+        inputs = [m.listed_start, m.listed, self.term.model.node, m.first, m.radius]
+        inputs += [at.turn.real, at.centre.real, at.x.real, at.node_v.real, at.v.real]
+        inputs.append((self.no_arm if at_end else self.arm).real)
+        outputs = [by_x.real, by_v.real, self.rigid.real, self.turn_bar.real]
+        s.each_real(self.k.node_bars, m.count, inputs, outputs)
+
+    def rigid_bars(self, wide: Rows, *, by_velocities: bool) -> None:
+        """That is told in the places of rigid modes."""
+        inputs = [by_velocities, self.model.first_wide, self.rigid.real]
+        self.shard.each_real(self.k.rigid_bars, self.model.count, inputs, [wide.real])
+
+    def turn_back(self) -> None:
+        """Gradients by what the end of the step has made of the unknowns become those by these; needs ``turn_bars``."""
+        s, m, g = self.shard, self.model, self.gradients
+        motion = self._motion()
+        inputs = [s.lanes, *motion[:5], m.moment_stride, *motion[5:], *self._moments(), self.h]
+        outputs = [g.mode_q, g.mode_v, self.turn_bar.real, self.start_bar.real, self.end_bar.real, self.rate_bar.real]
+        s.each_real(self.k.turn_back, m.count, inputs, [*outputs, self.q0_bar.real, self.q1_bar.real])
+        self._of_moments(self.end_bar, self.q1_bar, g.mode_q)
+        self._of_moments(self.rate_bar, self.nothing, g.mode_v)
+
+    def _of_moments(self, moment_bar: Rows, mode_bar: Rows, bar: wp.array) -> None:
+        s, m = self.shard, self.model
+        inputs = [s.lanes, m.moment_body, m.moment_start, m.moment_first, m.moment_stride, m.moments]
+        inputs += [m.first, m.modes, moment_bar.real, mode_bar.real]
+        s.each_real(self.k.moment_bars, int(m.moment_body.size), inputs, [bar])
+
+    def place(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
+        """Velocities and p of nodes, from what modes have in the axes of their bodies."""
+        s, m, at = self.shard, self.model, self.start
+        self.own_v.copy_from(node_v)
+        self.own_p.copy_from(node_p)
+        inputs = [m.listed, m.listed_body, self.term.model.node, m.block, self.term.model.mode_dof, m.radius]
+        inputs += [at.turn.real, at.centre.real, at.x.real, s.work.dof_v.real, p.real]
+        outputs = [self.own_v.real, self.own_p.real, node_v.real, node_p.real]
+        s.each_real(self.k.turn_fields, int(m.listed.size), inputs, outputs)
+
+    def pull(
+        self,
+        tets: TetAdjoint | None,
+        skin: MembraneAdjoint | None,
+        node_v: Rows,
+        node_p: Rows,
+        p: Rows,
+        corner: Rows,
+        *,
+        parameters: bool,
+    ) -> None:
+        """Elements, which feel turning by their damping alone.
+
+        Args:
+            tets: Linear tetrahedra.
+            skin: Membranes.
+            node_v: Velocities of nodes.
+            node_p: Their p.
+            p: That of dofs.
+            corner: Receives gradients by corners.
+            parameters: Whether those by parameters are asked for.
+        """
+        s, m, r, w, k = self.shard, self.model, self.term.model, self.shard.work, self.k_pull
+        inputs, outputs = [w.body_stiffness.real, w.body_damping.real], [self.elastic.real, self.damped.real]
+        s.each_real(k.split_stiffness, s.model.body_count, inputs, outputs)
+        self.asks = parameters
+        held: list[tuple[Rows, Rows, int, int]] = [(corner, self.corner, 1, -1)]
+        if tets is not None:
+            held.append((tets.parameter, tets.parameter, of_tets.ROWS, of_tets.PARAMETERS))
+        if skin is not None:
+            held.append((skin.parameter, skin.parameter, membrane_adjoint.PARAMETERS, 2))
+        if not self.parameter:
+            self.parameter = [s.rows(part.real.shape[1]) for part, _, _, _ in held]
+        for v, along, stiffness, h in (
+            (self.own_v, self.own_p, self.elastic, self.h),
+            (node_v, node_p, self.damped, 0.0),
+        ):
+            if tets is not None:
+                tets.pull(v, along, stiffness, h, corner, parameters=parameters)
+            if skin is not None:
+                skin.pull(v, along, stiffness, h, corner)
+            if h > 0.0:
+                for (part, _, _, _), room in zip(held, self.parameter, strict=True):
+                    room.copy_from(part)
+        for (part, _, size, omit), room in zip(held, self.parameter, strict=True):
+            s.each_real(k.join, part.real.shape[1], [size, omit, room.real], [part.real])
+        given = [m.block, r.mode_dof, m.radius, w.body_damping.real, w.frame_axes.real]
+        given += [node_v.real, node_p.real, w.dof_v.real, p.real]
+        if tets is not None:
+            inputs = [samples.TET, 0, r.tet_sample, m.tet_body, s.model.tet_node, s.model.tet_body, *given]
+            s.each_real(k.drag_bars, int(m.tet_body.size), [*inputs, w.sample_stiffness.real], [corner.real])
+        if skin is not None:
+            thin = skin.model
+            inputs = [samples.TRI, s.model.tet_count, r.tri_sample, m.tri_body, thin.tri_node, thin.element_body]
+            inputs += [*given, w.thin_stiffness.real]
+            s.each_real(k.drag_bars, int(m.tri_body.size), inputs, [corner.real])
+
+    def to_state(self, index: AdjointIndex, p: Rows, q: Rows, corner: Rows) -> None:
+        """Gradients by velocities, turns and arms at the start, by density, Rayleigh's alpha and gravity.
+
+        Args:
+            index: Of the model.
+            p: Adjoint of the velocities of dofs.
+            q: That of rows.
+            corner: Gradients by corners of elements.
+        """
+        s, m, r, at = self.shard, self.model, self.term.model, self.start
+        i, w, g = s.input, s.work, self.gradients
+        inputs = [
+            r.wide_count,
+            self.h,
+            s.lanes,
+            self.asks,
+            m.body,
+            m.first,
+            m.modes,
+            m.block,
+            r.mode_dof,
+            m.moment_start,
+        ]
+        inputs += [m.first_wide, m.radius, m.volume, w.body_mass.real, w.body_damping.real, w.wide_drag.real]
+        inputs += [w.turning_drag.real, i["density"].real, i["gravity"].real, i["mode_turn0"].real, i["mode_q0"].real]
+        inputs += [i["mode_v0"].real, w.dof_v.real, p.real, w.start_moment.real]
+        outputs = [g.mode_v, g.density, g.rayleigh_mass, g.gravity]
+        outputs += [self.turn_bar.real, self.start_bar.real, self.q0_bar.real]
+        s.each_real(self.k_pull.turning_bars, None, inputs, outputs)
+        points = [index.node_point_start, index.node_point, index.node_point_weight]
+        inputs = [s.model.corner_start, s.model.corner, *points, corner.S, self.no_point.S]
+        s.each(self.k_sums.node_sums, s.model.node_count, inputs, [self.element_bar.S])
+        inputs = [self.h, m.listed_start, m.listed, r.node, m.block, r.mode_dof, m.radius, *points, index.point_row]
+        inputs += [at.centre.real, at.x.real, self.own_v.real, self.own_p.real, w.dof_v.real, p.real]
+        inputs += [w.point_gradient.real, w.multiplier.real, q.real, w.node_external.real, self.element_bar.real]
+        s.each_real(self.k_pull.arm_bars, m.count, inputs, [self.arm.real, self.turn_bar.real])
+
+    def finish(self) -> None:
+        """Gradients by amplitudes that inertia has, and by quaternions, at the start; nodes are taken over before."""
+        s, g = self.shard, self.gradients
+        self._of_moments(self.start_bar, self.q0_bar, g.mode_q)
+        inputs = [s.lanes, self.start.turn.real, self.turn_bar.real]
+        s.each_real(self.k.give_turns, self.model.count, inputs, [g.mode_turn])

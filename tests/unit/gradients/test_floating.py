@@ -1,0 +1,146 @@
+"""Gradients of reduced bodies that turn with a floating frame, against central differences in float64."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import softwarp as sw
+from softwarp import meshing
+from softwarp.gradients import Rollout, States
+from tests.gradient_cases import STEPS, Inputs, gradients
+from tests.reduction_cases import AIR, SLAB, quadratic_modes, reduced_by, scene
+from tests.unit.gradients import test_reduced
+from tests.unit.gradients.test_forward_frames import compare
+from tests.unit.gradients.test_reduced import axis_of
+from tests.unit.gradients.test_rods import check
+
+SIZES = {
+    **test_reduced.SIZES,
+    "state": {**test_reduced.SIZES["state"], "mode_turn": 1e-5},
+    "parameters": {**test_reduced.SIZES["parameters"], "rayleigh_mass": 1e-1, "membrane_youngs": 1e3},
+}
+
+
+def slab(
+    num_worlds: int = 1,
+    precision: str = "float64",
+    device: str = "cpu",
+    *,
+    law: Any = None,
+    air: str = "volume",
+    beside: bool = False,
+    **options: Any,
+) -> sw.Simulation:
+    """The free slab of ``reduction_cases`` with two thirds of its elements.
+
+    Args:
+        num_worlds: Of the model.
+        precision: Likewise.
+        device: Likewise.
+        law: Material.
+        air: Control of its chamber.
+        beside: Whether a soft body that is not reduced is in the same scene.
+        **options: Of the simulation.
+    """
+    builder = scene(held=False, contact=False, law=law, lone=air != "volume")
+    if air != "volume":
+        shell = meshing.compact(AIR.nodes + (0.01, 0.005, 0.003), AIR.surface())
+        builder.add_cavity(0, *shell, control=air)  # type: ignore[arg-type]
+        builder.add_cable(0, [(x, 0.015, 0.009) for x in (0.06, 0.03, 0.0)], control="force")
+    weights = np.random.default_rng(0).uniform(0.5, 1.5, len(SLAB.tets))
+    weights[::3] = 0.0
+    builder.reduce(0, reduced_by(quadratic_modes(), frame="floating", tet_weight=weights))
+    if beside:
+        mesh = meshing.box((0.03, 0.02, 0.01), (2, 2, 1))
+        other = builder.add_tets(mesh.nodes + 0.1, mesh.tets, material=sw.Corotational(5e4, 0.3), density=900.0)
+        builder.fix(other, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 0.1001)))
+    model = builder.finalize(num_worlds=num_worlds, precision=precision, device=device)
+    return sw.Simulation(model, dt=0.01, **options)
+
+
+def given_of(sim: sw.Simulation, seeds: list[int]) -> Inputs:
+    """Inputs of ``STEPS`` steps: tumbling bodies, each turned its own way."""
+    given = test_reduced.given_of(sim, seeds, nodes=sim.model.own_node_count > 0)
+    turns = [np.random.default_rng(100 + seed).standard_normal((1, 4)) for seed in seeds]
+    turn = torch.tensor(np.stack(turns)).to(sim.node_x)
+    given["state"]["mode_turn"] = turn / turn.norm(dim=-1, keepdim=True)
+    given["state"]["mode_q"][:, 3:6] = 0.0
+    given["state"]["mode_v"][:, 3:6] *= 3.0
+    return given
+
+
+def loss(states: States) -> torch.Tensor:
+    """A number for every world; of quaternions too."""
+    weight = torch.tensor(np.random.default_rng(8).standard_normal((len(states.mode_turn), 1, 1, 4)))
+    return test_reduced.loss(states) + 0.1 * (states.mode_turn * weight.to(states.mode_turn)).flatten(2).sum(dim=(0, 2))
+
+
+SCENES = {
+    "tumbling": slab,
+    "of a projected law": partial(slab, law=sw.StableNeoHookean(1e5, 0.3)),
+    "under pressure": partial(slab, air="pressure"),
+    "beside a soft body, with gas": partial(slab, air="gas", beside=True),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_gradients_are_those_of_differences(name: str) -> None:
+    """By amplitudes, velocities, turns, commands and all parameters."""
+    sim = SCENES[name]()
+    check(Rollout(sim), given_of(sim, [1]), loss, SIZES)
+
+
+def test_forward_mode_agrees() -> None:
+    """By rows of modes and turns; nodes follow them: y . J d = d . J' y in every input."""
+    sim = slab()
+    compare(Rollout(sim), given_of(sim, [1]), loss)
+
+
+@pytest.mark.parametrize(("options", "precision", "device"), test_reduced.PATHS)
+def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
+    options: dict[str, Any], precision: str, device: str
+) -> None:
+    """Three worlds that differ in all inputs, then each alone, with and without kept factors."""
+    seeds = [1, 2, 3]
+    batch, single = (slab(count, precision, device, **options) for count in (3, 1))
+    together, rollout = gradients(Rollout(batch), given_of(batch, seeds), loss), Rollout(single)
+    for world, seed in enumerate(seeds):
+        alone = gradients(rollout, given_of(single, [seed]), loss)
+        kept = gradients(rollout, given_of(single, [seed]), loss, factors=True)
+        for group, held in alone.items():
+            for name, value in held.items():
+                axis = axis_of(group, name)
+                assert torch.equal(together[group][name].select(axis, world), value.select(axis, 0)), (group, name)
+                assert torch.equal(kept[group][name], value), (group, name)
+
+
+def test_steps_are_those_of_the_simulation() -> None:
+    """To the bit, from a turn that was given."""
+    sim = slab()
+    given = given_of(sim, [1])
+    states = Rollout(sim)(given["state"], given["controls"], given["parameters"])
+    for group, target in (("state", sim), ("parameters", sim.params)):
+        for name, value in given[group].items():
+            getattr(target, name)[...] = value
+    for step in range(STEPS):
+        for name, value in given["controls"].items():
+            getattr(sim.control, name)[...] = value if name == "node_force" else value[step]
+        sim.step()
+        for name in ("node_x", "node_v", "mode_q", "mode_v", "mode_turn"):
+            assert torch.equal(getattr(sim, name), getattr(states, name)[step]), name
+
+
+@pytest.mark.cuda
+def test_a_gpu_finds_the_same() -> None:
+    """To what sums in another order leave."""
+    found = []
+    for device in ("cpu", "cuda:0"):
+        sim = slab(2, device=device)
+        found.append(gradients(Rollout(sim), given_of(sim, [1, 2]), loss))
+    for group, held in found[0].items():
+        for name, value in held.items():
+            error = (found[1][group][name].cpu() - value).abs().max()
+            assert error <= 1e-8 * value.abs().max(), (group, name, float(error), float(value.abs().max()))
