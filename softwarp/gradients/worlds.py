@@ -23,9 +23,10 @@ from softwarp.solvers.look_adjoint import LookStepAdjoint
 from softwarp.solvers.look_directional import LookStepDirection
 from softwarp.solvers.newton_adjoint import NewtonAdjoint
 from softwarp.solvers.repeats import RepeatingEuler
-from softwarp.solvers.second_order import SecondOrder, stepper
+from softwarp.solvers.second_order import BDF2, SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from softwarp.solvers.system import System
+from softwarp.solvers.trapezoidal_adjoint import TrapezoidalAdjoint
 from softwarp.threads import Workers, alone
 
 if TYPE_CHECKING:
@@ -373,7 +374,8 @@ def _adjoint(
 ) -> StepAdjoint | SecondOrderAdjoint:
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
-        return SecondOrderAdjoint(steps, gradients, index)
+        kind = SecondOrderAdjoint if steps.stages is BDF2 else TrapezoidalAdjoint
+        return kind(steps, gradients, index)
     if steps.control is not None:
         return NewtonAdjoint(steps, gradients, index)
     if steps.system.model.joints is not None:

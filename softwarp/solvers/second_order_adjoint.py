@@ -46,7 +46,7 @@ class SecondOrderAdjoint:
         system, device = stepper.system, stepper.shard.device
         self.k = stage_adjoint.kernels(system.variant)
         self.k_frames = extrapolated_adjoint.kernels(system.variant)
-        self.pulls = [self._stage(step, index) for step in (*stepper.steps, stepper.third)]
+        self.pulls = [self._stage(step, index) for step in self.steps]
         held = {field.name: getattr(gradients, field.name) for field in fields(Gradients)}
         self.all = {name: array for name, array in held.items() if array.shape[1]}
         self.frames = model.frames if (model := system.model).has_moving_frames else None
@@ -61,6 +61,11 @@ class SecondOrderAdjoint:
         self.rests, self.sums, self.before = like(self.moved), like(self.commands), like(self.all)
         self.ends = {name: array for name, array in stepper.arrays.items() if name in FRAMES}
         self.ends, self.middle = like(self.ends), like(stepper.arrays)
+
+    @property
+    def steps(self) -> list[ImplicitEuler | PredictedEuler]:
+        """What the adjoints are of."""
+        return [*self.stepper.steps, self.stepper.third]
 
     def _stage(self, step: ImplicitEuler | PredictedEuler, index: AdjointIndex) -> StepAdjoint:
         if isinstance(step, PredictedEuler):
@@ -98,15 +103,11 @@ class SecondOrderAdjoint:
         wp.capture_if(stepper.any, partial(self._pull_third, parameters=parameters))
         self._pull(self.pulls[1], second, parameters)
         self._add(self.commands, self.sums)
-        rough = stepper.rough
-        for name in self.moved:
-            if name in MOVED:
-                bar = self.moved[name]
-                self._launch(self.k.part, [first.factor, stepper.shard.lanes, bar, rough], [bar, self.rests[name]])
+        self._split(first.factor)
         if self.frames is not None:
-            self._split_frames(self.frames, first)
+            self._split_frames(self.frames, 0, stepper.start, self.ends)
         stepper.give_back()
-        rough.zero_()  # which the first stage judges anew on its way
+        stepper.rough.zero_()  # which the first stage judges anew on its way
         self._pull(self.pulls[0], first, parameters)
         self._add(self.sums, self.commands)
         self._add(self.rests, self.moved)
@@ -131,24 +132,33 @@ class SecondOrderAdjoint:
         for name, total in totals.items():
             self._launch(self.k.add, [parts[name]], [total])
 
-    def _split_frames(self, frames: FrameModel, first: Stage) -> None:
-        """Gradients by extrapolated frames become those by the end of the first stage and by the start of the step."""
+    def _split(self, factor: float) -> None:
+        """Gradients by what is extrapolated in lines become those by the end of a stage and by its start."""
+        s, rough = self.stepper.shard, self.stepper.rough
+        for name, bar in self.moved.items():
+            if name in MOVED:
+                self._launch(self.k.part, [factor, s.lanes, bar, rough], [bar, self.rests[name]])
+
+    def _split_frames(
+        self, frames: FrameModel, number: int, first: dict[str, wp.array], last: dict[str, wp.array]
+    ) -> None:
+        """The same of frames, with the states that they are extrapolated from behind a stage."""
         stepper, s = self.stepper, self.stepper.shard
-        starts = [stepper.start[name] for name in FRAMES]
-        ends = [self.ends[name] for name in FRAMES]
+        stage, of_stage = stepper.stages[number], self.pulls[number].frames
+        starts = [first[name] for name in FRAMES]
+        ends = [last[name] for name in FRAMES]
         bars = [self.moved[name] for name in FRAMES]
         rests = [self.rests[name] for name in FRAMES]
         for rest in rests:
             rest.zero_()
-        inputs = [first.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0], stepper.rough]
+        inputs = [stage.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0], stepper.rough]
         s.each_real(self.k_frames.part_frames, frames.count, inputs, [*bars, *rests])
-        of_first = self.pulls[0].frames
-        if of_first is not None:
-            of_first.more_share.zero()
-            lapse = (first.factor - 1.0) * first.length * stepper.h
-            inputs = [first.factor, lapse, s.lanes, frames.frame_master, frames.frame_spin]
+        if of_stage is not None:
+            of_stage.more_share.zero()
+            lapse = (stage.factor - 1.0) * stage.length * stepper.h
+            inputs = [stage.factor, lapse, s.lanes, frames.frame_master, frames.frame_spin]
             inputs += [starts[0], starts[1], ends[0], ends[1], s.work.compound.real, stepper.rough]
-            s.each_real(self.k_frames.part_tops, frames.count, inputs, [*bars, *rests, of_first.more_share.real])
+            s.each_real(self.k_frames.part_tops, frames.count, inputs, [*bars, *rests, of_stage.more_share.real])
 
     def _pull(self, pull: StepAdjoint, stage: Stage, parameters: bool) -> None:
         self.stepper.set_lag(stage)

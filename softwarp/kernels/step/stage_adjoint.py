@@ -137,6 +137,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 force_bar_out[world, row] = h * node_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def add_ahead(
+        # Model
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        ahead_in: wp.array3d(dtype=real),
+        # Workspace out
+        seed_out: wp.array3d(dtype=real),
+        y_out: wp.array3d(dtype=real),
+    ):
+        """Add what a later solution has of the velocities of one dof to the right-hand sides of the one before it."""
+        pack, dof, lane = wp.tid()
+        for c in range(3):
+            more = dof_free[dof, c] * ahead_in[pack, 3 * dof + c, lane]
+            seed_out[pack, 3 * dof + c, lane] = seed_out[pack, 3 * dof + c, lane] + more
+            y_out[pack, 3 * dof + c, lane] = y_out[pack, 3 * dof + c, lane] + more
+
+    @wp.kernel(module=module, enable_backward=False)
     def part(
         factor: real,
         lanes: int,
@@ -175,6 +192,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         start_points=start_points,
         start_frames=start_frames,
         nodes=nodes,
+        add_ahead=add_ahead,
         part=part,
         add=add,
     )
