@@ -98,9 +98,6 @@ def _options(sim: Simulation) -> Iterator[str]:
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
-    passes = sim.options.contact_passes
-    if sim.model.contact is not None and passes > 0 and sim.options.newton_iterations == 1:
-        yield f"contact that is measured anew (contact_passes={passes}) {told}, or contact_passes=0"
     if sim.options.pressure_tangent and sim.options.newton_iterations == 1:
         yield f"the tangent of pressures {told}, or pressure_tangent=False"
 

@@ -17,6 +17,7 @@ from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.joint_adjoint import JointStepAdjoint
+from softwarp.solvers.look_adjoint import LookStageAdjoint
 from softwarp.solvers.newton_adjoint import NewtonAdjoint
 from softwarp.solvers.second_order import ALL, SMOOTH, THIRD, PredictedEuler, SecondOrder, Stage
 from softwarp.solvers.stage_adjoint import StageAdjoint
@@ -68,6 +69,8 @@ class SecondOrderAdjoint:
         return [*self.stepper.steps, self.stepper.third]
 
     def _stage(self, step: ImplicitEuler | PredictedEuler, index: AdjointIndex) -> StepAdjoint:
+        if isinstance(step, PredictedEuler) and step.system.multipliers.corrections:
+            return LookStageAdjoint(step, self.gradients, index, self._heed)
         if isinstance(step, PredictedEuler):
             return StageAdjoint(
                 step.system, step.h, step.pace, step.predict, self.gradients, index, step.judge, self._heed

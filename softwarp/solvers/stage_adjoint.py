@@ -142,7 +142,9 @@ class StageAdjoint(StepAdjoint):
     def _seed(self, *, first: bool = True) -> None:
         super()._seed(first=first)
         if isinstance(self.frames, LeaningFrames):
-            self.frames.turn_seed(self.seed, self.system.linear.y, self.solved_v)
+            self.frames.early.zero()
+            if first:  # what looks ahead turns by velocities as they are solved
+                self.frames.turn_seed(self.seed, self.system.linear.y, self.solved_v)
             self.shard.work.dof_v.copy_from(self.solved_v)
 
     def _to_state(self) -> None:
