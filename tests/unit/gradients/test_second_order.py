@@ -23,9 +23,9 @@ SLOW = pytest.mark.slow
 
 
 def second(sim: sw.Simulation, **options: Any) -> sw.Simulation:
-    """The same scene with steps of BDF2 that look at contacts once."""
+    """The same scene with steps of BDF2."""
     exact = EXACT if sim.model.precision == "float64" else {}
-    return sw.Simulation(sim.model, dt=sim.dt, integrator="bdf2", contact_passes=0, **{**exact, **options})
+    return sw.Simulation(sim.model, dt=sim.dt, integrator="bdf2", **{**exact, **options})
 
 
 @pytest.fixture
@@ -41,6 +41,7 @@ def thirds(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return found
 
 
+@pytest.mark.parametrize("passes", [0, 1])
 @pytest.mark.parametrize(
     ("mu", "speed", "laws", "expected"),
     [
@@ -50,10 +51,10 @@ def thirds(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     ],
 )
 def test_laws_of_contact(
-    mu: float, speed: float, laws: dict[str, float], expected: set[int], thirds: list[bool]
+    mu: float, speed: float, laws: dict[str, float], expected: set[int], passes: int, thirds: list[bool]
 ) -> None:
-    """A cube with a cable on a floor, by state, commands, moduli and friction."""
-    sim = second(test_contact.block(mu, **laws))
+    """A cube with a cable on a floor, by state, commands, moduli and friction; without and with a look ahead."""
+    sim = second(test_contact.block(mu, **laws), contact_passes=passes)
     given = test_contact.thrown(sim, speed)
     check(Rollout(sim), given, test_contact.loss, own=1e-5)
     assert test_contact.modes(sim, given) >= expected
