@@ -179,7 +179,11 @@ class Rollout:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
         factors = checks.flag(factors, "rollout: factors")
         if factors and not self.worlds.solution_bytes:
-            told = "newton_iterations above 1" if self.worlds.sim.options.integrator == "euler" else f"integrator {self.worlds.sim.options.integrator!r}"
+            told = (
+                "newton_iterations above 1"
+                if self.worlds.sim.options.integrator == "euler"
+                else f"integrator {self.worlds.sim.options.integrator!r}"
+            )
             raise ValueError(f"rollout: {told} keeps no factors; leave factors=True out")
         return Plan(tuple(given), frozenset(moving), count, every, factors, self._rest), given
 

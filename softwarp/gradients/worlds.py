@@ -374,8 +374,8 @@ def _adjoint(
 ) -> StepAdjoint | SecondOrderAdjoint:
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
-        kind = SecondOrderAdjoint if steps.stages is BDF2 else TrapezoidalAdjoint
-        return kind(steps, gradients, index)
+        of_stages = SecondOrderAdjoint if steps.stages is BDF2 else TrapezoidalAdjoint
+        return of_stages(steps, gradients, index)
     if steps.control is not None:
         return NewtonAdjoint(steps, gradients, index)
     if steps.system.model.joints is not None:

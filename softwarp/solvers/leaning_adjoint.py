@@ -109,7 +109,14 @@ class LeaningFrames(FrameAdjoint):
         inputs = [self.h, self.follows, s.lanes, s.model.node_count]
         inputs += [m.frame_master, m.frame_spin, m.frame_owner, m.owner_body, m.frame_dof]
         inputs += [self.item_start, self.item, m.carried_slot, m.corner_start, m.corner, self.is_kinematic]
-        inputs += [self.heeds.real, w.body_damping.real, i["pose0"].real, self.start_v.real, self.twist0.real, w.compound.real]
+        inputs += [
+            self.heeds.real,
+            w.body_damping.real,
+            i["pose0"].real,
+            self.start_v.real,
+            self.twist0.real,
+            w.compound.real,
+        ]
         inputs += [self.felt_v.real, p.real, self.frame_p.real, self.start.real, self.corner.real, self.way.real]
         inputs += [self.items.real, self.felt.real, self.bare.real, self.early.real]
         inputs += [self.there.real, self.sooner.real]

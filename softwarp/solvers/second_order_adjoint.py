@@ -1,4 +1,4 @@
-"""The adjoint of a step of second order: its stages and the extrapolations behind them. Theory: docs/theory/adjoint.md."""
+"""The adjoint of a step of second order: stages with an extrapolation between. Theory: docs/theory/adjoint.md."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class StageAdjoint(StepAdjoint):
     """
 
     predicts = True
-    touches = StartContacts
+    touches: type[ContactAdjoint] = StartContacts
     follows = 1.0
 
     def __init__(
@@ -78,7 +78,8 @@ class StageAdjoint(StepAdjoint):
         super().__init__(system, h, gradients, index)
         assert self.leaning is not None
         self.start_v = self.leaning.start_v
-        self.pace, self.predict, self.judge, self.heed = pace, predict, judge, heed
+        self.look, self.predict, self.judge, self.heed = pace.look, predict, judge, heed
+        self.pace = pace
         s = self.shard
         self.k_stage = stage_adjoint.kernels(s.variant)
         self.lapse, self.is_stage = pace.lapse, True
@@ -108,7 +109,7 @@ class StageAdjoint(StepAdjoint):
         system.command(h, self.pace)
         self._note_start()
         if isinstance(self.contact, StartContacts):
-            system.find_contacts(h, moving=False, look=self.pace.look)
+            system.find_contacts(h, moving=False, look=self.look)
         if self.judge is not None:
             self.judge()
         if self.heed is not None:
@@ -123,7 +124,7 @@ class StageAdjoint(StepAdjoint):
         system.measure_rows()
         system.row_laws()
         if self.contact is not None and not isinstance(self.contact, StartContacts):
-            system.find_contacts(h, moving=True, look=self.pace.look)
+            system.find_contacts(h, moving=True, look=self.look)
 
     def solve_again(self) -> None:
         """Take the stage as far as its solution, from the system's state; the state stays as it is."""
@@ -163,7 +164,14 @@ class StageAdjoint(StepAdjoint):
         seed = self._meet()
         inputs = [self.h, self.follows, s.lanes, m.node_dof, m.node_body, m.dof_free]
         inputs += [x.node_point_start, x.node_point, x.node_point_weight]
-        inputs += [self.heeds.real, i["density"].real, s.felt["beta"].real, w.body_mass.real, seed.real, self.leaning.pushed.real]
+        inputs += [
+            self.heeds.real,
+            i["density"].real,
+            s.felt["beta"].real,
+            w.body_mass.real,
+            seed.real,
+            self.leaning.pushed.real,
+        ]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real, self.start_point.real]
         outputs = [g.node_x, g.node_v, g.command_node_force, self.ahead.real]
         s.each_real(self.k_stage.nodes, m.node_count, inputs, outputs)

@@ -55,7 +55,9 @@ class LaterAdjoint(StageAdjoint):
         names = [*STATE, *FRAMES, *MEMORIES]
         names += [field.name for field in fields(gradients) if field.name.startswith("command_")]
         parts = [getattr(gradients, name) for name in names]
-        self.sums = [(part, memory.zeros(part.shape, part.dtype, step.system.shard.device)) for part in parts if part.size]
+        self.sums = [
+            (part, memory.zeros(part.shape, part.dtype, step.system.shard.device)) for part in parts if part.size
+        ]
 
     def _recall(self) -> None:
         """The velocities that the first solution has led to."""

@@ -410,9 +410,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """As ``adjoint.frame_gradients``, and in ``memory`` the gradient by e y, of one frame.
 
         ``predicts`` is 1 in a stage, where segments and items act at the pose that ``start_v_in`` lead to, velocities
-        of dofs, else 0, and in worlds where these are 0; forces on a free top act at that of the start. ``follows`` is 1 if these velocities are those
-        of the start; ``ahead`` receives the gradients by them. ``there_in`` has more by place and turn at that pose,
-        ``sooner_in`` by these velocities.
+        of dofs, else 0, and in worlds where these are 0; forces on a free top act at that of the start. ``follows`` is
+        1 if these velocities are those of the start; ``ahead`` receives the gradients by them. ``there_in`` has more by
+        place and turn at that pose, ``sooner_in`` by these velocities.
         """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from softwarp.gradients import Diverged, Rollout, States
+from softwarp.gradients import Rollout, States
 from tests.gradient_cases import CHANGES, STEPS, Inputs, cube, gradients, inputs, weights
 
 LAWS = [

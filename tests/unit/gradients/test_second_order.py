@@ -1,4 +1,4 @@
-"""Gradients of steps of second order: rough ones, as beside contact, and the trapezoidal rule, by central differences."""
+"""Gradients of steps of second order against differences: rough ones, as beside contact, and the trapezoidal rule."""
 
 from typing import Any
 
@@ -129,7 +129,9 @@ def test_worlds_beside_change_no_bit_of_contact(precision: str) -> None:
                 assert torch.equal(batch[group][name].select(axis, world), wanted), (seeds, group, name)
 
 
-@pytest.mark.parametrize("options", [{}, pytest.param({"newton_iterations": 60, "newton_tolerance": 1e-13}, marks=SLOW)])
+@pytest.mark.parametrize(
+    "options", [{}, pytest.param({"newton_iterations": 60, "newton_tolerance": 1e-13}, marks=SLOW)]
+)
 def test_both_modes_agree(options: dict[str, Any]) -> None:
     """To rounding, beside contact."""
     sim = second(test_contact.block(0.5), **options)
@@ -175,8 +177,9 @@ def test_worlds_beside_change_no_bit_of_the_trapezoidal_rule(precision: str) -> 
     def found(seeds: list[int]) -> Inputs:
         sim = swinging(len(seeds), precision)
         v = torch.stack([torch.tensor(np.random.default_rng(seed).standard_normal((27, 3))) for seed in seeds])
-        given = {"state": {"node_v": 0.05 * v.to(sim.node_x), "body_twist": 0.0 * sim.body_twist + v[:, :1, :1].to(sim.node_x)}}
-        given |= {"controls": {}, "parameters": {"youngs": sim.params.youngs.clone(), "gravity": sim.params.gravity.clone()}}
+        v = 0.05 * v.to(sim.node_x)
+        given: Inputs = {"state": {"node_v": v, "body_twist": sim.body_twist + 20.0 * v[:, :1, :1]}, "controls": {}}
+        given["parameters"] = {name: getattr(sim.params, name).clone() for name in ("youngs", "gravity")}
         return gradients(Rollout(sim), given, test_every_input.loss, steps=STEPS)
 
     others = [[1], [2], [3]] if precision == "float64" else [[1, 1, 1], [2, 2, 2], [3, 3, 3]]
@@ -190,7 +193,8 @@ def test_worlds_beside_change_no_bit_of_the_trapezoidal_rule(precision: str) -> 
 def test_what_the_trapezoidal_rule_has_no_gradient_with_is_told() -> None:
     """What rods carry, by name and with the way out."""
     builder = sw.ModelBuilder()
-    rod = builder.add_rod(np.linspace((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 4), radius=0.01, youngs=5e6, nu=0.4, density=1e3)
+    line = np.linspace((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 4)
+    rod = builder.add_rod(line, radius=0.01, youngs=5e6, nu=0.4, density=1e3)
     box = builder.add_rigid(sw.Box((0.05, 0.03, 0.02)), mass=0.05, pose=(0.2, 0.0, 0.0))
     builder.attach(box, to=rod, node=3)
     sim = sw.Simulation(builder.finalize(num_worlds=1), integrator="trapezoidal")
