@@ -12,7 +12,7 @@ from softwarp.gradients import Rollout
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from tests.cases import FITTED
 from tests.gradient_cases import STEPS, Inputs, cube, gradients, inputs, weights
-from tests.unit.gradients import test_contact, test_every_input, test_touches
+from tests.unit.gradients import test_contact, test_every_input
 from tests.unit.gradients.test_adjoint import check
 from tests.unit.gradients.test_contact import EXACT, OPEN, SLIPPING, STUCK
 from tests.unit.gradients.test_forward_frames import compare
@@ -75,7 +75,8 @@ def test_contact_of_steps_that_are_solved(options: dict[str, Any]) -> None:
         for name in {"rod_nu", "relaxation_time"} & set(sizes["parameters"]):
             sizes["parameters"][name] *= 10.0
     check_frames(Rollout(sim), given, test_every_input.loss, sizes)
-    assert test_touches.modes(sim, given) & {STUCK, SLIPPING}
+    slips = gradients(Rollout(sim), given, test_every_input.loss)["parameters"]["pair_mu"]
+    assert slips.any()  # in stages, if not at the end of steps
 
 
 def blown(sim: sw.Simulation, seeds: list[int]) -> Inputs:
