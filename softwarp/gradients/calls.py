@@ -121,7 +121,6 @@ def check_steps(call: Call) -> None:
     worlds, plan = call.worlds, call.plan
     _check_failed(worlds.failed)
     _check_unfinished(worlds.unfinished)
-    _check_rough(worlds.rough)
     if "control.body_velocity" in plan.names:
         _check_lagging(worlds.lagging)
     _check_room(worlds.state["contact_overflow"], worlds.model)
@@ -178,16 +177,6 @@ def _check_lagging(lagging: torch.Tensor) -> None:
             f"rollout: in world {worlds[0]} and {len(worlds) - 1} others a kinematic body moved otherwise than its "
             "body_velocity says, which then has no gradient; keep it within max_speed and max_spin, and let a new "
             "body_pose be reached before"
-        )
-
-
-def _check_rough(rough: torch.Tensor) -> None:
-    worlds = rough.nonzero().flatten().tolist()
-    if worlds:
-        raise Diverged(
-            f"rollout: world {worlds[0]} and {len(worlds) - 1} others took a step of integrator 'bdf2' as a rough one, "
-            "which has no gradient, as speeds or accelerations strain elements much in a step; take a shorter dt, "
-            "milder commands, or integrator='euler'"
         )
 
 

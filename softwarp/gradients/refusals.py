@@ -85,9 +85,11 @@ def _resting_frames(sim: Simulation) -> Iterator[str]:
 
 def _options(sim: Simulation) -> Iterator[str]:
     options = sim.options
-    if options.integrator == "trapezoidal" and sim.model.row_count == 0 and sim.model.contact is None:
-        told = "steps of integrator 'trapezoidal' have no gradient yet where they are not those of 'bdf2'"
-        yield f"{told}; take integrator='bdf2' or 'euler'"
+    frames = sim.model.frames
+    if options.integrator == "trapezoidal" and sim.model.row_count == 0 and sim.model.contact is None and frames:
+        if frames.carried_count:
+            told = "rods and rigid bodies that carry something have no gradient with integrator 'trapezoidal' yet"
+            yield f"{told}; take integrator='bdf2' or 'euler'"
     if options.repeat_swing < float("inf"):
         told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
         yield f"{told} have no gradient yet; take repeat_swing=inf"
@@ -96,8 +98,6 @@ def _options(sim: Simulation) -> Iterator[str]:
 def _second_order(sim: Simulation) -> Iterator[str]:
     """What steps of ``bdf2`` have no gradient with."""
     told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
-    if sim.model.contact is not None:
-        yield f"contact {told}, which it falls back to beside contact anyway, with a shorter dt"
     if sim.options.pressure_tangent and sim.options.newton_iterations == 1:
         yield f"the tangent of pressures {told}, or pressure_tangent=False"
 

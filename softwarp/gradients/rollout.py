@@ -74,8 +74,8 @@ class Rollout:
 
     Args:
         sim: Soft bodies of linear or quadratic tetrahedra, reduced or not, with cables and chambers, rods, rigid
-            bodies, and joints; backward Euler or, without contact, BDF2, with one linearisation per step or as many
-            as solve it. Its ``dt`` and options are taken over now.
+            bodies, and joints; steps of all integrators, with one linearisation per step or as many as solve it. Its
+            ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
 
     Raises:
@@ -180,7 +180,11 @@ class Rollout:
             raise ValueError(f"rollout: every must divide steps, got every={every} and steps={count}")
         factors = checks.flag(factors, "rollout: factors")
         if factors and not self.worlds.solution_bytes:
-            told = "newton_iterations above 1" if self.worlds.sim.options.integrator == "euler" else "integrator 'bdf2'"
+            told = (
+                "newton_iterations above 1"
+                if self.worlds.sim.options.integrator == "euler"
+                else f"integrator {self.worlds.sim.options.integrator!r}"
+            )
             raise ValueError(f"rollout: {told} keeps no factors; leave factors=True out")
         return Plan(tuple(given), frozenset(moving), count, every, factors, self._rest), given
 

@@ -34,9 +34,10 @@ from softwarp.solvers.look_adjoint import LookStepAdjoint
 from softwarp.solvers.look_directional import LookStepDirection
 from softwarp.solvers.newton_adjoint import NewtonAdjoint
 from softwarp.solvers.repeats import RepeatingEuler
-from softwarp.solvers.second_order import SecondOrder, stepper
+from softwarp.solvers.second_order import BDF2, SecondOrder, stepper
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from softwarp.solvers.system import System
+from softwarp.solvers.trapezoidal_adjoint import TrapezoidalAdjoint
 from softwarp.threads import Workers, alone
 
 if TYPE_CHECKING:
@@ -181,7 +182,6 @@ class DifferentiableWorlds:
         pressed: Largest compression of an element in the steps since ``start``, (world,).
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
         unfinished: Likewise, worlds where the iterations of a step ended above their tolerance.
-        rough: Likewise, worlds that a step of second order has taken as a rough one.
         lagging: Likewise, worlds where a kinematic body had another velocity than its command.
     """
 
@@ -214,11 +214,6 @@ class DifferentiableWorlds:
             for each, part in zip(steppers, parts, strict=True)
             if not isinstance(each, RepeatingEuler)  # refused before
         ]
-        self._rough = [
-            ((worlds.start, worlds.stop), wp.to_torch(each.rough, requires_grad=False).flatten())
-            for (worlds, _), each in zip(twins, steppers, strict=True)
-            if isinstance(each, SecondOrder)
-        ]
         self._workers = workers = Workers(len(twins)) if len(twins) > 1 else None
         self._directions: Directions | RowDirections | None = None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
@@ -234,8 +229,8 @@ class DifferentiableWorlds:
         self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
         self._spare: list[list[torch.Tensor]] = []
         self.pressed = torch.zeros_like(self.state["compression"])
-        self.failed, self.unfinished, self.rough, self.lagging = (
-            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(4)
+        self.failed, self.unfinished, self.lagging = (
+            torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(3)
         )
         self._adrift = [
             ((worlds.start, worlds.stop), wp.to_torch(part.adrift, requires_grad=False).flatten())
@@ -264,7 +259,6 @@ class DifferentiableWorlds:
             self.parameters[name].copy_(value)
         self.failed.zero_()
         self.unfinished.zero_()
-        self.rough.zero_()
         for _, told in (*self._adrift, *self._unsure):
             told.zero_()
         self.lagging.zero_()
@@ -323,8 +317,6 @@ class DifferentiableWorlds:
             behind = (self.state["body_twist"] - told).abs() > LAG * (1.0 + told.abs().amax())
             behind = behind[:, self._kinematic].flatten(1).any(dim=1)
             self.lagging.logical_or_(behind)
-        for (begin, end), rough in self._rough:
-            self.rough[begin:end].logical_or_(rough[: end - begin] != 0)
 
     @property
     def adrift(self) -> torch.Tensor:
@@ -395,7 +387,8 @@ def _adjoint(
 ) -> StepAdjoint | SecondOrderAdjoint:
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
-        return SecondOrderAdjoint(steps, gradients, index)
+        of_stages = SecondOrderAdjoint if steps.stages is BDF2 else TrapezoidalAdjoint
+        return of_stages(steps, gradients, index)
     if steps.control is not None:
         return NewtonAdjoint(steps, gradients, index, rest=rest)
     if steps.system.model.joints is not None:

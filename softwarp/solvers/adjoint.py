@@ -184,7 +184,7 @@ class StepAdjoint:
         """Take the step as far as its solution, from the system's state; the state stays as it is."""
         system, h = self.system, self.h
         self._load()
-        system.find_contacts(h, moving=False)
+        system.find_contacts(h, moving=False, look=None if self.pace is None else self.pace.look)
         self._find_forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=False)

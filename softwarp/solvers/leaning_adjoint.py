@@ -35,6 +35,7 @@ class LeaningFrames(FrameAdjoint):
         mind: Gradients by e y of frames.
         felt_v: Velocities of dofs that inertia resists.
         ahead: Gradients by the velocities of dofs that a stage is linearised with.
+        heeds: 1 in worlds where that stage is linearised with velocities that may not be 0, else 0.
         sooner, there: More of these that others have found, and by place and turn where these velocities lead to.
     """
 
@@ -43,7 +44,8 @@ class LeaningFrames(FrameAdjoint):
         s = self.shard
         self.k_felt, self.k_memory = leaning_adjoint.kernels(s.variant), relaxation_adjoint.kernels(s.variant)
         self.term = next((term for term in system.terms if isinstance(term, RelaxationTerm)), None)
-        self.predicts = predicts
+        self.predicts, self.heeds = predicts, s.rows(1)
+        self.heeds.real.fill_(float(predicts))
         self.start_v, self.lean, self.felt_v, self.ahead, self.sooner = (s.rows(s.dof_room) for _ in range(5))
         self.there = s.rows(6 * model.count)
         self.differences: Callable[[Rows], None] | None = None  # takes from velocities what no momentum has
@@ -104,10 +106,17 @@ class LeaningFrames(FrameAdjoint):
         inputs = [s.model.node_count, m.welded_frame, m.frame_owner, m.owner_body, m.slot_carried]
         inputs += [w.body_damping.real, self.items.real]
         s.each_real(self.k_felt.welded_felt, m.welded_frame.size, inputs, [self.felt.real])
-        inputs = [self.h, float(self.predicts), self.follows, s.lanes, s.model.node_count]
+        inputs = [self.h, self.follows, s.lanes, s.model.node_count]
         inputs += [m.frame_master, m.frame_spin, m.frame_owner, m.owner_body, m.frame_dof]
         inputs += [self.item_start, self.item, m.carried_slot, m.corner_start, m.corner, self.is_kinematic]
-        inputs += [w.body_damping.real, i["pose0"].real, self.start_v.real, self.twist0.real, w.compound.real]
+        inputs += [
+            self.heeds.real,
+            w.body_damping.real,
+            i["pose0"].real,
+            self.start_v.real,
+            self.twist0.real,
+            w.compound.real,
+        ]
         inputs += [self.felt_v.real, p.real, self.frame_p.real, self.start.real, self.corner.real, self.way.real]
         inputs += [self.items.real, self.felt.real, self.bare.real, self.early.real]
         inputs += [self.there.real, self.sooner.real]

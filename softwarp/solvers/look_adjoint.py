@@ -6,6 +6,7 @@ seeds an adjoint of its own, with the same factor. Equations: docs/theory/adjoin
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 
 import warp as wp
@@ -15,7 +16,10 @@ from softwarp.model import memory
 from softwarp.model.gradients import FRAMES, MEMORIES, MODES, STATE, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.second_order import PredictedEuler
+from softwarp.solvers.stage_adjoint import StageAdjoint
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace.rows import Rows
 
 
 class FirstSolution:
@@ -24,6 +28,7 @@ class FirstSolution:
     Args:
         system: Worlds, with contacts.
         h: Step [s].
+        guess: Velocities that solutions come on top of, in a stage that is linearised with them.
 
     Attributes:
         u, row, force: Velocities of the first solution, its forces of static rows and of contacts.
@@ -32,8 +37,9 @@ class FirstSolution:
         any: Whether any contact looks there.
     """
 
-    def __init__(self, system: System, h: float) -> None:
+    def __init__(self, system: System, h: float, guess: Rows | None = None) -> None:
         assert system.contact is not None
+        self.guess = guess
         self.system, self.h, self.shard, self.term = system, h, system.shard, system.contact
         s, capacity = self.shard, self.term.contacts.capacity
         self.k, self.contacts = look_adjoint.kernels(s.variant), self.term.contacts
@@ -62,6 +68,8 @@ class FirstSolution:
         s, w, c, o = self.shard, self.shard.work, self.contacts, self.system.options
         if number == 0:
             self.u.copy_from(w.u)
+            if self.guess is not None:
+                s.add(self.guess, self.u, s.dof_rows)
             if self.term.subspace is not None:
                 self.term.subspace.expand(self.u)
             if s.model.row_count:
@@ -91,24 +99,23 @@ class FirstSolution:
             w.multiplier.copy_from(self.row)
 
 
-class LookStepAdjoint(StepAdjoint):
-    """Adjoint of a step that looks once at contacts where its first solution leads to; see ``StepAdjoint``.
+class Looking(StepAdjoint):
+    """Adjoint of what looks once at contacts where its first solution leads to; see ``StepAdjoint``.
 
     Worlds in which no contact that pushes has anything of that look add 0, and if there are no others, the first
     solution is left out.
     """
 
-    def __init__(
-        self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
-    ) -> None:
-        super().__init__(system, h, gradients, index, rest=rest)
+    first: FirstSolution
+
+    def _look_at(self, first: FirstSolution) -> None:
+        """Room, and what the first solution leaves."""
         assert self.contact is not None
-        assert system.contact is not None
-        s = self.shard
-        self.first = FirstSolution.of(system, h)
+        s, gradients = self.shard, self.gradients
+        self.first = first
         self.k_look, self.contacts = self.first.k, self.contact.contacts
         self.v, self.extra = (s.rows(3 * self.model.dof_room) for _ in range(2))
-        self.ahead = s.rows(3 * self.contacts.capacity)
+        self.ways = s.rows(3 * self.contacts.capacity)
         self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
         g = gradients
         names = [*STATE, *FRAMES, *MEMORIES, *MODES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
@@ -118,11 +125,6 @@ class LookStepAdjoint(StepAdjoint):
             for name, part in parts
             if part.size
         }  # a gradient, by the end of the first solution's way, and what it was before
-
-    @property
-    def solution(self) -> list[wp.array]:
-        """As of ``StepAdjoint``, with the first solution and what contacts look at."""
-        return [*super().solution, *self.first.arrays]
 
     def pull(self, *, parameters: bool = True) -> None:
         """As of ``StepAdjoint``."""
@@ -135,13 +137,13 @@ class LookStepAdjoint(StepAdjoint):
         assert self.contact is not None
         s, c, k = self.shard, self.contacts, self.k_look
         self._look_back()
-        s.each_real(k.ways, c.capacity, [c.count.real, self.first.look.real, self.contact.z.real], [self.ahead.real])
+        s.each_real(k.ways, c.capacity, [c.count.real, self.first.look.real, self.contact.z.real], [self.ways.real])
         for bar, part, total in self.sums.values():
             s.each_real(k.hand_over, bar.shape[1], [s.lanes, part], [bar, total])
-        c.multiplier.copy_from(self.ahead)
+        c.multiplier.copy_from(self.ways)
         self.extra.zero()
         self.contact.laws.add_forces(self.extra, self.h)
-        self.first.place()
+        self._place_first()
         self._seed(first=False)
         s.add(self.extra, self.seed, s.dof_rows)
         for correction in range(1 + self.system.options.refinement):
@@ -166,4 +168,59 @@ class LookStepAdjoint(StepAdjoint):
             if part is not None:
                 part.zero_()
         self.contact.to_end(self.p, *places)
+        self._return()
+
+    def _place_first(self) -> None:
+        """Put what the first solution has found in the place of what the last one has."""
+        self.first.place()
+
+    def _return(self) -> None:
+        """Put everything where elements and rows have it."""
         self._start_over()
+
+
+class LookStepAdjoint(Looking):
+    """Such a step, as of ``StepAdjoint``."""
+
+    def __init__(
+        self, system: System, h: float, gradients: Gradients, index: AdjointIndex, *, rest: bool = False
+    ) -> None:
+        super().__init__(system, h, gradients, index, rest=rest)
+        self._look_at(FirstSolution.of(system, h))
+
+    @property
+    def solution(self) -> list[wp.array]:
+        """As of ``StepAdjoint``, with the first solution and what contacts look at."""
+        return [*super().solution, *self.first.arrays]
+
+
+class LookStageAdjoint(Looking, StageAdjoint):
+    """Such a stage of a longer step, as of ``StageAdjoint``."""
+
+    def __init__(
+        self,
+        step: PredictedEuler,
+        gradients: Gradients,
+        index: AdjointIndex,
+        heed: Callable[[Rows], None] | None = None,
+    ) -> None:
+        super().__init__(step.system, step.h, step.pace, step.predict, gradients, index, step.judge, heed)
+        self._look_at(FirstSolution(step.system, step.h, self.start_v))
+
+    def solve_again(self) -> None:
+        """As of ``StageAdjoint``; another stage of the same worlds may have watched the last solve."""
+        self.system.watch = self.first.keep
+        super().solve_again()
+        self.v.copy_from(self.shard.work.dof_v)
+        self._return()
+
+    def _place_first(self) -> None:
+        super()._place_first()
+        self.solved_v.copy_from(self.first.u)
+        self.final_v.copy_from(self.first.u)
+
+    def _return(self) -> None:
+        v = self.shard.work.dof_v
+        v.copy_from(self.start_v)
+        self.system.move(self.h)
+        v.copy_from(self.v)

@@ -57,7 +57,7 @@ class NewtonAdjoint(StageAdjoint):
         self.given, self.total = s.rows(s.dof_rows), s.rows(s.dof_rows)
         self.start_frames = s.rows(6 * max(self.model.frame_count, 1))
         self.control = s.rows(newton_adjoint.ROWS)
-        self.sooner, self.other_seed = s.rows(s.dof_rows), s.rows(s.dof_rows)
+        self.sooner = s.rows(s.dof_rows)
         if self.contact is not None:
             self.contact.u = self.start_v
         term = next((term for term in self.system.terms if isinstance(term, JointTerm)), None)

@@ -57,7 +57,7 @@ class Stage:
 
 _FIRST = Stage(GAMMA, GAMMA, 1.0, (1.0 - GAMMA, 1.0 - GAMMA), factor=1.0 / GAMMA - 1.0)
 _SECOND = Stage(GAMMA, 1.0 - GAMMA, 0.0, (0.0, 1.0 - GAMMA / (1.0 - GAMMA)), keep=False)
-_THIRD = Stage(1.0 - 2.0 * GAMMA, 0.0, 0.0, (0.0, 0.0), keep=False)
+THIRD = Stage(1.0 - 2.0 * GAMMA, 0.0, 0.0, (0.0, 0.0), keep=False)
 BDF2 = (_FIRST, _SECOND)
 TRAPEZOIDAL = (
     Stage(0.25, 0.5, 1.0, (0.75, 0.75), factor=2.0),
@@ -144,7 +144,7 @@ class SecondOrder:
         self.guess = self._guess()
         self.rough, self.failed, self.worst = (self._codes() for _ in range(3))
         self.steps = [self._euler(stage, first=number == 0) for number, stage in enumerate(self.stages)]
-        self.third = self._euler(_THIRD, first=False)
+        self.third = self._euler(THIRD, first=False)
 
     @property
     def _keeps_twice(self) -> bool:
@@ -182,8 +182,7 @@ class SecondOrder:
         for number in range(len(self.stages)):
             self.take(number)
         if self.stages is BDF2:
-            self.any.zero_()
-            self.shard.each_real(self.k.gather, None, [self.rough], [self.any])
+            self.find_any()
             if self.always:
                 self._finish_rough()
             else:
@@ -194,11 +193,11 @@ class SecondOrder:
 
     def keep(self) -> None:
         """Note the state as that of the start."""
-        self._copy(ALL, self.rough, self.arrays, self.start)
+        self.copy(ALL, self.rough, self.arrays, self.start)
 
     def give_back(self) -> None:
         """The start's state once more."""
-        self._copy(ALL, self.rough, self.start, self.arrays)
+        self.copy(ALL, self.rough, self.start, self.arrays)
 
     def take(self, number: int) -> None:
         """One stage, and the extrapolation behind it."""
@@ -209,7 +208,7 @@ class SecondOrder:
         """One stage."""
         stage = self.stages[number]
         if stage.keep and self._keeps_twice:
-            self._copy(ALL, self.rough, self.moving, self.base)
+            self.copy(ALL, self.rough, self.moving, self.base)
         self.set_lag(stage)
         self.steps[number].step()
         self._note(first=number == 0, which=ALL)
@@ -222,13 +221,18 @@ class SecondOrder:
         if self.stages[number].factor != 1.0:
             self._extrapolate(self.stages[number])
 
+    def find_any(self) -> None:
+        """Whether any world is rough."""
+        self.any.zero_()
+        self.shard.each_real(self.k.gather, None, [self.rough], [self.any])
+
     def _finish_rough(self) -> None:
         """The third stage of rough worlds."""
-        self._copy(SMOOTH, self.rough, self.arrays, self.smooth)
-        self.set_lag(_THIRD)
+        self.copy(SMOOTH, self.rough, self.arrays, self.smooth)
+        self.set_lag(THIRD)
         self.third.step()
         self._note(first=False, which=ROUGH)
-        self._copy(SMOOTH, self.rough, self.smooth, self.arrays)
+        self.copy(SMOOTH, self.rough, self.smooth, self.arrays)
 
     def set_lag(self, stage: Stage) -> None:
         """What a stage leaves to later ones, in the workspace."""
@@ -291,9 +295,9 @@ class SecondOrder:
         inputs = [self.h, s.lanes, self.start["time"], self.worst]
         s.each_real(self.k.finish, None, inputs, [self.arrays["status"], self.arrays["time"], self.failed])
         back = {name: array for name, array in self.start.items() if name not in COUNTS}
-        self._copy(FAILED, self.failed, back, self.arrays)
+        self.copy(FAILED, self.failed, back, self.arrays)
 
-    def _copy(self, which: int, code: wp.array, source: dict[str, Any], target: dict[str, Any]) -> None:
+    def copy(self, which: int, code: wp.array, source: dict[str, Any], target: dict[str, Any]) -> None:
         """Copy the arrays of ``source`` to those of the same names, in worlds whose code is ``which``."""
         s = self.shard
         for name, array in source.items():

@@ -1,8 +1,9 @@
-"""The adjoint of a step of BDF2: its two stages and the extrapolation between them. Theory: docs/theory/adjoint.md."""
+"""The adjoint of a step of second order: stages with an extrapolation between. Theory: docs/theory/adjoint.md."""
 
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -16,17 +17,19 @@ from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.implicit_euler import ImplicitEuler
 from softwarp.solvers.joint_adjoint import JointStepAdjoint
+from softwarp.solvers.look_adjoint import LookStageAdjoint
 from softwarp.solvers.newton_adjoint import NewtonAdjoint
-from softwarp.solvers.second_order import SecondOrder, Stage
+from softwarp.solvers.second_order import ALL, SMOOTH, THIRD, PredictedEuler, SecondOrder, Stage
 from softwarp.solvers.stage_adjoint import StageAdjoint
+from softwarp.solvers.workspace.rows import Rows
 
 MOVED = ("node_x", "node_v", *MEMORIES)  # what is extrapolated along straight lines
 
 
 class SecondOrderAdjoint:
-    """Pulls gradients by the end of a step back to its start, for the smooth worlds of one system.
+    """Pulls gradients by the end of a step of BDF2 back to its start, for the worlds of one system.
 
-    Rough worlds, which take other stages, have gradients that mean nothing; ``SecondOrder.rough`` tells which they are.
+    Rough worlds have a third stage, and nothing that is extrapolated.
 
     Args:
         stepper: Takes the step; its system has the state that the step started from.
@@ -35,6 +38,7 @@ class SecondOrderAdjoint:
 
     Attributes:
         solution: Nothing is kept of a step.
+        pulls: Adjoints of the stages; the last one is that of rough worlds.
     """
 
     def __init__(self, stepper: SecondOrder, gradients: Gradients, index: AdjointIndex) -> None:
@@ -43,25 +47,42 @@ class SecondOrderAdjoint:
         system, device = stepper.system, stepper.shard.device
         self.k = stage_adjoint.kernels(system.variant)
         self.k_frames = extrapolated_adjoint.kernels(system.variant)
-
-        self.pulls = [self._stage(number, index) for number in range(len(stepper.stages))]
+        self.pulls = [self._stage(step, index) for step in self.steps]
         held = {field.name: getattr(gradients, field.name) for field in fields(Gradients)}
-        names = [*MOVED, *FRAMES, *(name for name in held if name.startswith("command_"))]
-        self.arrays = {name: held[name] for name in names if name in held and held[name].shape[1]}
-        self.kept = {name: memory.zeros(a.shape, a.dtype, device) for name, a in self.arrays.items()}
+        self.all = {name: array for name, array in held.items() if array.shape[1]}
         self.frames = model.frames if (model := system.model).has_moving_frames else None
-        if self.frames is None:
-            self.arrays = {name: array for name, array in self.arrays.items() if name not in FRAMES}
-        frames = {name: array for name, array in self.arrays.items() if name in FRAMES}
-        self.middle = {name: memory.zeros(a.shape, a.dtype, device) for name, a in frames.items()}
+        self.commands = {name: array for name, array in self.all.items() if name.startswith("command_")}
+        self.moved = {name: array for name, array in self.all.items() if name in MOVED}
+        if self.frames is not None:
+            self.moved |= {name: array for name, array in self.all.items() if name in FRAMES}
 
-    def _stage(self, number: int, index: AdjointIndex) -> StepAdjoint:
-        stepper, gradients, step = self.stepper, self.gradients, self.stepper.steps[number]
-        if isinstance(step, ImplicitEuler):
-            if step.control is None:  # beside joints, at the start
-                return JointStepAdjoint(step.system, step.h, gradients, index, step.pace)
-            return NewtonAdjoint(step, gradients, index)
-        return StageAdjoint(stepper.system, step.h, step.pace, stepper.predict, gradients, index)
+        def like(arrays: dict[str, wp.array]) -> dict[str, wp.array]:
+            return {name: memory.zeros(array.shape, array.dtype, device) for name, array in arrays.items()}
+
+        self.rests, self.sums, self.before = like(self.moved), like(self.commands), like(self.all)
+        self.ends = {name: array for name, array in stepper.arrays.items() if name in FRAMES}
+        self.ends, self.middle = like(self.ends), like(stepper.arrays)
+
+    @property
+    def steps(self) -> list[ImplicitEuler | PredictedEuler]:
+        """What the adjoints are of."""
+        return [*self.stepper.steps, self.stepper.third]
+
+    def _stage(self, step: ImplicitEuler | PredictedEuler, index: AdjointIndex) -> StepAdjoint:
+        if isinstance(step, PredictedEuler) and step.system.multipliers.corrections:
+            return LookStageAdjoint(step, self.gradients, index, self._heed)
+        if isinstance(step, PredictedEuler):
+            return StageAdjoint(
+                step.system, step.h, step.pace, step.predict, self.gradients, index, step.judge, self._heed
+            )
+        if step.control is None:  # beside joints, at the start
+            return JointStepAdjoint(step.system, step.h, self.gradients, index, step.pace)
+        return NewtonAdjoint(step, self.gradients, index)
+
+    def _heed(self, target: Rows) -> None:
+        """1 in smooth worlds, else 0."""
+        stepper = self.stepper
+        stepper.shard.each_real(stepper.k.set_lag, None, [1.0, 0.0, stepper.rough], [target.real])
 
     def step(self) -> None:
         """Gradients by the end of the step from the system's state become those by its start."""
@@ -76,38 +97,71 @@ class SecondOrderAdjoint:
         stepper.rough.zero_()
         stepper.keep()
         stepper.solve(0)
-        for name, array in self.middle.items():
+        for name, array in self.ends.items():
             wp.copy(array, stepper.arrays[name])
         stepper.extrapolate(0)
+        for array in self.sums.values():
+            array.zero_()
+        stepper.find_any()
+        wp.capture_if(stepper.any, partial(self._pull_third, parameters=parameters))
         self._pull(self.pulls[1], second, parameters)
-        for name, array in self.arrays.items():
-            if name in MOVED:
-                self._launch(self.k.part, [first.factor, array], [array, self.kept[name]])
-            elif name not in FRAMES:
-                wp.copy(self.kept[name], array)
+        self._add(self.commands, self.sums)
+        self._split(first.factor)
         if self.frames is not None:
-            self._split_frames(self.frames, first)
+            self._split_frames(self.frames, 0, stepper.start, self.ends)
         stepper.give_back()
+        stepper.rough.zero_()  # which the first stage judges anew on its way
         self._pull(self.pulls[0], first, parameters)
-        for name, array in self.arrays.items():
-            self._launch(self.k.add, [self.kept[name]], [array])
+        self._add(self.sums, self.commands)
+        self._add(self.rests, self.moved)
 
-    def _split_frames(self, frames: FrameModel, first: Stage) -> None:
-        """Gradients by extrapolated frames become those by the end of the first stage and by the start of the step."""
+    def _pull_third(self, *, parameters: bool) -> None:
+        """The third stage of rough worlds."""
+        stepper = self.stepper
+        self._copy(ALL, stepper.arrays, self.middle)
+        stepper.solve(1)
+        for array in self.commands.values():
+            array.zero_()
+        self._copy(ALL, self.all, self.before)
+        self._pull(self.pulls[2], THIRD, parameters)
+        self._copy(SMOOTH, self.before, self.all)
+        self._copy(ALL, self.commands, self.sums)
+        self._copy(ALL, self.middle, stepper.arrays)
+
+    def _copy(self, which: int, source: dict[str, wp.array], target: dict[str, wp.array]) -> None:
+        self.stepper.copy(which, self.stepper.rough, source, target)
+
+    def _add(self, parts: dict[str, wp.array], totals: dict[str, wp.array]) -> None:
+        for name, total in totals.items():
+            self._launch(self.k.add, [parts[name]], [total])
+
+    def _split(self, factor: float) -> None:
+        """Gradients by what is extrapolated in lines become those by the end of a stage and by its start."""
+        s, rough = self.stepper.shard, self.stepper.rough
+        for name, bar in self.moved.items():
+            if name in MOVED:
+                self._launch(self.k.part, [factor, s.lanes, bar, rough], [bar, self.rests[name]])
+
+    def _split_frames(
+        self, frames: FrameModel, number: int, first: dict[str, wp.array], last: dict[str, wp.array]
+    ) -> None:
+        """The same of frames, with the states that they are extrapolated from behind a stage."""
         stepper, s = self.stepper, self.stepper.shard
-        starts = [stepper.start[name] for name in FRAMES]
-        ends = [self.middle[name] for name in FRAMES]
-        bars = [self.arrays[name] for name in FRAMES]
-        rests = [self.kept[name] for name in FRAMES]
-        inputs = [first.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0]]
+        stage, of_stage = stepper.stages[number], self.pulls[number].frames
+        starts = [first[name] for name in FRAMES]
+        ends = [last[name] for name in FRAMES]
+        bars = [self.moved[name] for name in FRAMES]
+        rests = [self.rests[name] for name in FRAMES]
+        for rest in rests:
+            rest.zero_()
+        inputs = [stage.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0], stepper.rough]
         s.each_real(self.k_frames.part_frames, frames.count, inputs, [*bars, *rests])
-        of_first = self.pulls[0].frames
-        if of_first is not None:
-            of_first.more_share.zero()
-            lapse = (first.factor - 1.0) * first.length * stepper.h
-            inputs = [first.factor, lapse, s.lanes, frames.frame_master, frames.frame_spin]
-            inputs += [starts[0], starts[1], ends[0], ends[1], s.work.compound.real]
-            s.each_real(self.k_frames.part_tops, frames.count, inputs, [*bars, *rests, of_first.more_share.real])
+        if of_stage is not None:
+            of_stage.more_share.zero()
+            lapse = (stage.factor - 1.0) * stage.length * stepper.h
+            inputs = [stage.factor, lapse, s.lanes, frames.frame_master, frames.frame_spin]
+            inputs += [starts[0], starts[1], ends[0], ends[1], s.work.compound.real, stepper.rough]
+            s.each_real(self.k_frames.part_tops, frames.count, inputs, [*bars, *rests, of_stage.more_share.real])
 
     def _pull(self, pull: StepAdjoint, stage: Stage, parameters: bool) -> None:
         self.stepper.set_lag(stage)

@@ -11,10 +11,32 @@ from softwarp.kernels.step import stage_adjoint
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.leaning_adjoint import LeaningFrames
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.workspace.rows import Rows
+
+
+class StartContacts(ContactAdjoint):
+    """Contacts as they are at the start of a stage that is linearised elsewhere.
+
+    Attributes:
+        solved_v: Velocities of dofs as the stage has found them.
+    """
+
+    solved_v: Rows
+
+    def begin(self, v: Rows, *, first: bool = True) -> None:
+        """As of ``ContactAdjoint``, with these velocities."""
+        super().begin(self.solved_v, first=first)
+
+    def to_state(self, p: Rows) -> None:
+        """As of ``ContactAdjoint``; everything is at the start of the stage afterwards."""
+        self.shard.work.x.copy_from(self.shard.input["x0"])
+        for term in self.system.terms:
+            term.start_over()
+        super().to_state(p)
 
 
 class StageAdjoint(StepAdjoint):
@@ -30,6 +52,8 @@ class StageAdjoint(StepAdjoint):
         predict: Writes the velocities that it is linearised with.
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        judge: Called once contacts are known.
+        heed: Writes 1 where velocities that the stage is linearised with may not be 0, else 0; without, 1 is there.
         rest: Whether gradients by the rest shape are asked for.
 
     Attributes:
@@ -38,6 +62,7 @@ class StageAdjoint(StepAdjoint):
     """
 
     predicts = True
+    touches: type[ContactAdjoint] = StartContacts
     follows = 1.0
 
     def __init__(
@@ -48,19 +73,26 @@ class StageAdjoint(StepAdjoint):
         predict: Callable[[], None],
         gradients: Gradients,
         index: AdjointIndex,
+        judge: Callable[[], None] | None = None,
+        heed: Callable[[Rows], None] | None = None,
         *,
         rest: bool = False,
     ) -> None:
         super().__init__(system, h, gradients, index, rest=rest)
         assert self.leaning is not None
         self.start_v = self.leaning.start_v
-        self.pace, self.predict = pace, predict
+        self.look, self.predict, self.judge, self.heed = pace.look, predict, judge, heed
+        self.pace = pace
         s = self.shard
         self.k_stage = stage_adjoint.kernels(s.variant)
         self.lapse, self.is_stage = pace.lapse, True
         self.solved_v, self.final_v = s.rows(s.dof_room), s.rows(s.dof_room)
-        self.ahead = s.rows(s.dof_rows)
+        self.ahead, self.heeds, self.other_seed = s.rows(s.dof_rows), s.rows(1), s.rows(s.dof_rows)
+        self.heeds.real.fill_(1.0)
+        if isinstance(self.contact, StartContacts):
+            self.contact.solved_v = self.solved_v
         if isinstance(self.frames, LeaningFrames):
+            self.frames.heeds = self.heeds
             self.frames.end_v, self.frames.ahead, self.frames.follows = self.final_v, self.ahead, self.follows
         self.displacement = s.rows(s.work.displacement.real.shape[1])
         self.volume = s.rows(s.work.cavity_volume.real.shape[1])
@@ -79,6 +111,12 @@ class StageAdjoint(StepAdjoint):
             self.start_gradient.copy_from(w.point_gradient)
         system.command(h, self.pace)
         self._note_start()
+        if isinstance(self.contact, StartContacts):
+            system.find_contacts(h, moving=False, look=self.look)
+        if self.judge is not None:
+            self.judge()
+        if self.heed is not None:
+            self.heed(self.heeds)
         if self.leaning is not None:
             self.leaning.load()
         self.predict()
@@ -88,8 +126,8 @@ class StageAdjoint(StepAdjoint):
             self.frames.place()
         system.measure_rows()
         system.row_laws()
-        if self.contact is not None:
-            system.find_contacts(h, moving=True, look=None if self.pace is None else self.pace.look)
+        if self.contact is not None and not isinstance(self.contact, StartContacts):
+            system.find_contacts(h, moving=True, look=self.look)
 
     def solve_again(self) -> None:
         """Take the stage as far as its solution, from the system's state; the state stays as it is."""
@@ -108,7 +146,9 @@ class StageAdjoint(StepAdjoint):
     def _seed(self, *, first: bool = True) -> None:
         super()._seed(first=first)
         if isinstance(self.frames, LeaningFrames):
-            self.frames.turn_seed(self.seed, self.system.linear.y, self.solved_v)
+            self.frames.early.zero()
+            if first:  # what looks ahead turns by velocities as they are solved
+                self.frames.turn_seed(self.seed, self.system.linear.y, self.solved_v)
             self.shard.work.dof_v.copy_from(self.solved_v)
 
     def _to_state(self) -> None:
@@ -127,7 +167,14 @@ class StageAdjoint(StepAdjoint):
         seed = self._meet()
         inputs = [self.h, self.follows, s.lanes, m.node_dof, m.node_body, m.dof_free]
         inputs += [x.node_point_start, x.node_point, x.node_point_weight]
-        inputs += [i["density"].real, s.felt["beta"].real, w.body_mass.real, seed.real, self.leaning.pushed.real]
+        inputs += [
+            self.heeds.real,
+            i["density"].real,
+            s.felt["beta"].real,
+            w.body_mass.real,
+            seed.real,
+            self.leaning.pushed.real,
+        ]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real, self.start_point.real]
         outputs = [g.node_x, g.node_v, g.command_node_force, self.ahead.real]
         s.each_real(self.k_stage.nodes, m.node_count, inputs, outputs)
@@ -138,4 +185,8 @@ class StageAdjoint(StepAdjoint):
 
     def _meet(self) -> Rows:
         """Add what others have where the stage is linearised, and tell the seed less what they have as solved."""
-        return self.seed
+        if self.contact is None:
+            return self.seed
+        self.other_seed.copy_from(self.seed)
+        self.contact.add_forces(self.other_seed)
+        return self.other_seed

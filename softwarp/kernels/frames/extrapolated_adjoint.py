@@ -54,6 +54,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # State
         pose0_in: wp.array2d(dtype=real),
         pose1_in: wp.array2d(dtype=real),
+        # Workspace in
+        rough_in: wp.array3d(dtype=wp.int32),
         # State out
         pose_bar_out: wp.array2d(dtype=real),
         twist_bar_out: wp.array2d(dtype=real),
@@ -62,11 +64,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gradients by the extrapolated pose and twist of one frame, as those by both states that these follow from.
 
-        They are by the end of the stage before, in place, and by the start of the step. Free tops are left out.
+        They are by the end of the stage before, in place, and by the start of the step. Free tops are left out, and
+        rough worlds, where nothing is extrapolated.
         """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane
-        if world < pose_bar_out.shape[0] and frame_master[frame] == frame:
+        if world < pose_bar_out.shape[0] and frame_master[frame] == frame and rough_in[pack, 0, lane] == 0:
             if frame_spin[frame] != wp.static(Spin.FREE_TOP):
                 row = 7 * frame
                 for c in range(3):
@@ -120,6 +123,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         twist1_in: wp.array2d(dtype=real),
         # Workspace in
         compound_in: wp.array3d(dtype=real),
+        rough_in: wp.array3d(dtype=wp.int32),
         # State out
         pose_bar_out: wp.array2d(dtype=real),
         twist_bar_out: wp.array2d(dtype=real),
@@ -136,7 +140,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         world = pack * lanes + lane
         k = wp.static(COMPOUND_ROWS) * frame
         m = compound_in[pack, k, lane]
-        is_master = world < pose_bar_out.shape[0] and frame_master[frame] == frame
+        is_master = world < pose_bar_out.shape[0] and frame_master[frame] == frame and rough_in[pack, 0, lane] == 0
         if is_master and frame_spin[frame] == wp.static(Spin.FREE_TOP) and m > real(0.0):
             row = 7 * frame
             t = 6 * frame

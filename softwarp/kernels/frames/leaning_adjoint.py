@@ -364,7 +364,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def frame_gradients(
         h: real,
-        predicts: real,
         follows: real,
         lanes: int,
         nodes: int,
@@ -381,6 +380,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         corner: wp.array(dtype=wp.int32),
         is_kinematic: wp.array(dtype=real),
         # Workspace in
+        predicts_in: wp.array3d(dtype=real),
         damping_in: wp.array3d(dtype=real),
         pose0_in: wp.array3d(dtype=real),
         start_v_in: wp.array3d(dtype=real),
@@ -410,12 +410,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """As ``adjoint.frame_gradients``, and in ``memory`` the gradient by e y, of one frame.
 
         ``predicts`` is 1 in a stage, where segments and items act at the pose that ``start_v_in`` lead to, velocities
-        of dofs, else 0; forces on a free top act at that of the start. ``follows`` is 1 if these velocities are those
-        of the start; ``ahead`` receives the gradients by them. ``there_in`` has more by place and turn at that pose,
-        ``sooner_in`` by these velocities.
+        of dofs, else 0, and in worlds where these are 0; forces on a free top act at that of the start. ``follows`` is
+        1 if these velocities are those of the start; ``ahead`` receives the gradients by them. ``there_in`` has more by
+        place and turn at that pose, ``sooner_in`` by these velocities.
         """
         pack, frame, lane = wp.tid()
         world = pack * lanes + lane
+        predicts = predicts_in[pack, 0, lane]
         for c in range(6):
             memory_out[pack, 6 * frame + c, lane] = real(0.0)
         if world < pose_bar_out.shape[0] and frame_master[frame] != frame:

@@ -88,6 +88,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_point: wp.array(dtype=wp.int32),
         node_point_weight: wp.array(dtype=real),
         # Workspace in
+        predicts_in: wp.array3d(dtype=real),
         density_in: wp.array3d(dtype=real),
         beta_in: wp.array3d(dtype=real),
         body_mass_in: wp.array3d(dtype=real),
@@ -108,7 +109,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         ``node_bar_in`` is that by x, ``pushed_in`` s of dofs, ``point_bar_in`` that by points at the start; ``ahead``
         receives those by the velocities that the stage is linearised with, which ``follows`` is 1 for if they are
-        those of the start.
+        those of the start; ``predicts`` is 0 in worlds where they are 0.
         """
         pack, node, lane = wp.tid()
         world = pack * lanes + lane
@@ -129,26 +130,52 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 row = 3 * node + c
                 found = mass_p[c]
                 if dof >= 0:
-                    found += follows * by_v[c] * dof_free[dof, c]
+                    found += follows * predicts_in[pack, 0, lane] * by_v[c] * dof_free[dof, c]
                     ahead_out[pack, 3 * dof + c, lane] = by_v[c]
                 x_bar_out[world, row] = x_bar_out[world, row] + by_x[c]
                 v_bar_out[world, row] = found
                 force_bar_out[world, row] = h * node_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def add_ahead(
+        # Model
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        ahead_in: wp.array3d(dtype=real),
+        # Workspace out
+        seed_out: wp.array3d(dtype=real),
+        y_out: wp.array3d(dtype=real),
+    ):
+        """Add what a later solution has of the velocities of one dof to the right-hand sides of the one before it."""
+        pack, dof, lane = wp.tid()
+        for c in range(3):
+            more = dof_free[dof, c] * ahead_in[pack, 3 * dof + c, lane]
+            seed_out[pack, 3 * dof + c, lane] = seed_out[pack, 3 * dof + c, lane] + more
+            y_out[pack, 3 * dof + c, lane] = y_out[pack, 3 * dof + c, lane] + more
+
+    @wp.kernel(module=module, enable_backward=False)
     def part(
         factor: real,
+        lanes: int,
         # State
         bar_in: wp.array2d(dtype=real),
+        # Workspace in
+        rough_in: wp.array3d(dtype=wp.int32),
         # State out
         part_out: wp.array2d(dtype=real),
         rest_out: wp.array2d(dtype=real),
     ):
-        """Gradient by an extrapolated value, as those by the end of the stage before and by the start of the step."""
+        """Gradient by an extrapolated value, as those by the end of the stage before and by the start of the step.
+
+        In a rough world nothing is extrapolated.
+        """
         world, row = wp.tid()
         bar = bar_in[world, row]
-        part_out[world, row] = factor * bar
-        rest_out[world, row] = bar - factor * bar
+        part = bar
+        if rough_in[world / lanes, 0, world % lanes] == 0:
+            part = factor * bar
+        part_out[world, row] = part
+        rest_out[world, row] = bar - part
 
     @wp.kernel(module=module, enable_backward=False)
     def add(
@@ -165,6 +192,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         start_points=start_points,
         start_frames=start_frames,
         nodes=nodes,
+        add_ahead=add_ahead,
         part=part,
         add=add,
     )
