@@ -23,9 +23,10 @@ def block(
     device: str = "cpu",
     *,
     memory: tuple[float, float] = (0.0, 0.0),
+    skin: Any = None,
     **laws: float,
 ) -> sw.Simulation:
-    """A cube with a cable, and perhaps a Maxwell branch, on a floor that a kinematic body is."""
+    """A cube with a cable, and perhaps a Maxwell branch or a skin of its own, on a floor that a kinematic body is."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     body = builder.add_tets(
         meshing.box((SIDE, SIDE, SIDE), (2, 2, 2)),
@@ -33,6 +34,7 @@ def block(
         density=1e3,
         rayleigh=(0.5, 0.01),
         relaxation=memory,
+        contact_surface=skin,
     )
     builder.add_cable(body, [(0.02, 0.05, 0.03), (0.05, 0.04, 0.05), (0.08, 0.05, 0.07)], control="force")
     floor = builder.add_rigid(sw.Plane(), kinematic=True, name="floor")

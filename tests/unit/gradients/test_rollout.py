@@ -141,10 +141,6 @@ def _contact(builder: sw.ModelBuilder) -> None:
     builder.add_contact(body, body)
 
 
-def _contact_plane(builder: sw.ModelBuilder) -> None:
-    builder.add_contact(_box(builder), builder.add_rigid(sw.Plane(), kinematic=True))
-
-
 def _tubes(builder: sw.ModelBuilder) -> None:
     tubes = [sw.Tube([sw.TubeSection(0.2)], radius=0.4e-3, youngs=5e10)]
     builder.add_telescope([*tubes, sw.Tube([sw.TubeSection(0.1)], radius=1e-3, inner_radius=6e-4, youngs=5e10)])
@@ -171,8 +167,6 @@ def _inflated_beside_a_rod(builder: sw.ModelBuilder) -> None:
 
 
 REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] = [
-    (_box, {"integrator": "trapezoidal"}, "take integrator='bdf2' or 'euler'"),
-    (_contact_plane, {"integrator": "bdf2"}, "contact has no gradient with integrator 'bdf2'"),
     (_pieces, {}, "a rod that contact cuts into pieces has no gradient yet; leave contact_pieces out"),
     (_tubes, {}, "tubes that slide in each other"),
     (_touching_rod, {}, "as that of rods; take a shape, a mesh or a soft body"),

@@ -14,7 +14,7 @@ from tests.cases import FITTED
 from tests.gradient_cases import STEPS, Inputs, cube, gradients, inputs, weights
 from tests.unit.gradients import test_contact, test_every_input
 from tests.unit.gradients.test_adjoint import check
-from tests.unit.gradients.test_contact import EXACT, OPEN, SLIPPING, STUCK
+from tests.unit.gradients.test_contact import EXACT, OPEN, SIDE, SLIPPING, STUCK
 from tests.unit.gradients.test_forward_frames import compare
 from tests.unit.gradients.test_newton import NEWTON
 from tests.unit.gradients.test_rods import check as check_frames
@@ -59,6 +59,16 @@ def test_laws_of_contact(
     check(Rollout(sim), given, test_contact.loss, own=1e-5)
     assert test_contact.modes(sim, given) >= expected
     assert thirds
+
+
+def test_a_skin_apart_from_the_elements() -> None:
+    """A cube that touches the floor by points between its nodes, and slips."""
+    skin = 0.01 * SIDE + meshing.box((0.98 * SIDE,) * 3, (3, 3, 1)).nodes
+    sim = second(test_contact.block(0.3, skin=skin, compliance=1e-4))
+    given = test_contact.thrown(sim, 0.3)
+    check(Rollout(sim), given, test_contact.loss, own=1e-5)
+    assert SLIPPING in test_contact.modes(sim, given)
+
 
 
 @SLOW
