@@ -70,7 +70,6 @@ def test_a_skin_apart_from_the_elements() -> None:
     assert SLIPPING in test_contact.modes(sim, given)
 
 
-
 @SLOW
 @pytest.mark.parametrize("options", [{}, {"relaxes": True}, {"joints": True, "relaxes": True}])
 def test_contact_of_steps_that_are_solved(options: dict[str, Any]) -> None:
