@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from softwarp.scene.checks import distance, limits, node_indices
 from softwarp.scene.parts import BodySpec, CavitySpec, FloatArray, IntArray, MembraneSpec, Scene
 
 ATMOSPHERE = 101325.0  # Pa
+FACES = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])  # corners of a tet's, in any order
 ON_NODE = 1e-9  # share of other nodes below which a vertex lies on a node
 
 
@@ -55,7 +57,7 @@ def add_cavity(
     tets, weights = _embedded(spec, points, free, tolerance, label)
     middles = np.full((len(points), 3), -1, dtype=np.int32)
     if spec.elements is not None:
-        points, middles = _on_curved_faces(spec, points, free, tets, weights, outward)
+        points, middles = _on_curved_faces(spec, points, free, tets, weights, outward, label)
     given = {
         "min_pressure": min_pressure,
         "max_pressure": max_pressure,
@@ -139,16 +141,38 @@ def _on_curved_faces(
     tets: IntArray,
     weights: FloatArray,
     outward: IntArray,
+    label: str,
 ) -> tuple[FloatArray, IntArray]:
-    """Vertices, those in the middle of quadratic edges moved out, and the nodes that carry these (v, 3), else -1."""
+    """Vertices, those in the middle of quadratic edges moved out, and the nodes that carry these (v, 3), else -1.
+
+    Warns of faces of elements whose corners alone are given.
+    """
     assert spec.elements is not None
     nodes = np.take_along_axis(spec.mesh.tets[tets], weights.argmax(axis=1)[:, None], axis=1)[:, 0]
     on_node = free & (np.abs(weights.max(axis=1) - 1.0) < ON_NODE)
-    middles = meshing.surface_middles(spec.elements, np.where(on_node, nodes, -1), outward)
+    carriers = np.where(on_node, nodes, -1)
+    middles = meshing.surface_middles(spec.elements, carriers, outward)
+    faces = np.sort(spec.elements[:, FACES].reshape(-1, 3), axis=1)
+    count = len(spec.mesh.nodes)
+    bare = np.isin(_key(np.sort(carriers[outward], axis=1), count), _key(faces, count)).sum()
+    if bare:
+        warnings.warn(
+            f"cavity {label!r}: {bare} of its triangles have only the corners of faces of quadratic elements, whose "
+            f"middles then feel no pressure, so that its wall moves too far. Pass a solid's own wall, "
+            f"solid.cavities[name], or all six nodes of a face and its four triangles",
+            UserWarning,
+            stacklevel=4,
+        )
     is_middle = middles[:, 0] >= 0
     moved = points.copy()
     moved[is_middle] = np.einsum("k,vkc->vc", MIDDLE_WEIGHTS, spec.mesh.nodes[middles[is_middle]])
     return moved, middles
+
+
+def _key(triples: IntArray, count: int) -> NDArray[np.int64]:
+    """One number for each triple of sorted nodes; below 0 where one is -1."""
+    a, b, c = triples.astype(np.int64).T
+    return np.where(a < 0, -1, (a * count + b) * count + c)
 
 
 def _check_limits(bounds: dict[str, float], label: str) -> None:

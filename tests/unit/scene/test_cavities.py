@@ -86,3 +86,14 @@ def test_contact_capacity_is_checked_beside_a_chamber(builder, capacity):
     builder.add_contact(0, ball)
     with pytest.raises(ValueError, match=f"contact_capacity must be .* got {capacity}"):
         builder.finalize(contact_capacity=capacity)
+
+
+@pytest.mark.parametrize("six", [False, True])
+def test_corners_of_quadratic_faces_alone_are_warned_of(six, recwarn):
+    """Their middles would feel no pressure; all six nodes of every face, of the body's linear mesh, are right."""
+    builder, box = sw.ModelBuilder(), meshing.box((0.1, 0.1, 0.1), (2, 2, 2))
+    body = builder.add_tets(box, material=sw.NeoHookean(1e5, 0.4), density=1000.0, element="p2")
+    mesh = builder.bodies[body].mesh if six else box
+    builder.add_cavity(body, *meshing.compact(mesh.nodes, mesh.surface()), name="air")
+    told = [str(warning.message) for warning in recwarn]
+    assert told == [] if six else "'air': 48 of its triangles have only the corners" in told[0]
