@@ -147,7 +147,7 @@ def uncollected() -> Iterator[None]:
 
 
 @contextmanager
-def single_thread(device: str) -> Iterator[None]:
+def single_thread(device: torch.device) -> Iterator[None]:
     """Torch works in the calling thread alone meanwhile, on a CPU.
 
     Its other threads go on looking for work for milliseconds after each small operation, on the cores that step worlds
@@ -156,7 +156,7 @@ def single_thread(device: str) -> Iterator[None]:
     import torch
 
     count = torch.get_num_threads()
-    if count == 1 or wp.get_device(device).is_cuda:
+    if count == 1 or device.type != "cpu":
         yield
         return
     torch.set_num_threads(1)

@@ -362,7 +362,7 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
 
     def _advance(self, action: Tensor) -> Tensor:
         """Simulate one action in all worlds and update the buffers; reward (world, 1)."""
-        with interop.single_thread(self.sim.device):
+        with interop.single_thread(self.device):
             self._simulate(action)
             return self._account(action)
 
