@@ -14,7 +14,6 @@ from tests.gradient_cases import STEPS, Inputs, gradients
 from tests.reduction_cases import AIR, SLAB, quadratic_modes, reduced_by, scene
 from tests.unit.gradients import test_reduced
 from tests.unit.gradients.test_forward_frames import compare
-from tests.unit.gradients.test_reduced import axis_of
 from tests.unit.gradients.test_rods import check
 
 SIZES = {
@@ -104,17 +103,8 @@ def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
     options: dict[str, Any], precision: str, device: str
 ) -> None:
     """Three worlds that differ in all inputs, then each alone, with and without kept factors."""
-    seeds = [1, 2, 3]
     batch, single = (slab(count, precision, device, **options) for count in (3, 1))
-    together, rollout = gradients(Rollout(batch), given_of(batch, seeds), loss), Rollout(single)
-    for world, seed in enumerate(seeds):
-        alone = gradients(rollout, given_of(single, [seed]), loss)
-        kept = gradients(rollout, given_of(single, [seed]), loss, factors=True)
-        for group, held in alone.items():
-            for name, value in held.items():
-                axis = axis_of(group, name)
-                assert torch.equal(together[group][name].select(axis, world), value.select(axis, 0)), (group, name)
-                assert torch.equal(kept[group][name], value), (group, name)
+    test_reduced.equal_alone(batch, single, given_of, loss)
 
 
 def test_steps_are_those_of_the_simulation() -> None:

@@ -1,5 +1,6 @@
 """Gradients of steps of reduced bodies, by amplitudes, commands and parameters, against differences in float64."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -213,14 +214,14 @@ PATHS = [
 ]
 
 
-@pytest.mark.parametrize(("options", "precision", "device"), PATHS)
-@pytest.mark.parametrize("on", ["", "ball"])
-def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
-    on: str, options: dict[str, Any], precision: str, device: str
+def equal_alone(
+    batch: sw.Simulation,
+    single: sw.Simulation,
+    given_of: Callable[[sw.Simulation, list[int]], Inputs],
+    loss: Callable[[States], torch.Tensor],
 ) -> None:
-    """Three worlds that differ in all inputs, then each alone, with and without kept factors and states."""
+    """Gradients of three worlds are to the bit those of each alone, with and without kept factors."""
     seeds = [1, 2, 3]
-    batch, single = (slab(count, precision, device, on=on, **options) for count in (3, 1))
     together, rollout = gradients(Rollout(batch), given_of(batch, seeds), loss), Rollout(single)
     for world, seed in enumerate(seeds):
         alone = gradients(rollout, given_of(single, [seed]), loss)
@@ -230,6 +231,16 @@ def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
                 axis = axis_of(group, name)
                 assert torch.equal(together[group][name].select(axis, world), value.select(axis, 0)), (group, name)
                 assert torch.equal(kept[group][name], value), (group, name)
+
+
+@pytest.mark.parametrize(("options", "precision", "device"), PATHS)
+@pytest.mark.parametrize("on", ["", "ball"])
+def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
+    on: str, options: dict[str, Any], precision: str, device: str
+) -> None:
+    """Three worlds that differ in all inputs, then each alone, with and without kept factors and states."""
+    batch, single = (slab(count, precision, device, on=on, **options) for count in (3, 1))
+    equal_alone(batch, single, given_of, loss)
 
 
 def test_steps_are_those_of_the_simulation() -> None:
