@@ -7,7 +7,9 @@ solver, on the host. Theory: docs/theory/cholesky.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from softwarp.model.codes import PANEL_FIRST_STEP, PANEL_IDENTITY, PANEL_UPDATE
 from softwarp.model.structure import Symbolic
 
 IntArray = NDArray[np.int32]
+Table = NDArray[np.integer[Any]]
 
 WIDTH = 16  # columns of a panel, at most; benchmarks/trunk.py
 ZERO_SHARE = 0.4  # blocks of a panel that may be zeros, per block of L in it
@@ -226,18 +229,19 @@ class _Writer:
             if above[p] >= 0:
                 self.children[above[p]].append(p)
         self.update_place, self.update_rows = self._place_updates()
-        blocks = zip(symbolic.l_row.tolist(), symbolic.l_col.tolist(), symbolic.l_source.tolist(), strict=True)
-        self.source = {(i, j): source for i, j, source in blocks}
-        self.at = [{i: at for at, i in enumerate(below.tolist())} for below in rows]
-        self.item_source: list[tuple[int, ...]] = []
-        self.item_place: list[tuple[int, ...]] = []
-        self.child: list[tuple[int, ...]] = []
-        self.late_row: list[tuple[int, ...]] = []
-        self.column: list[tuple[int, ...]] = []
-        self.column_lower: list[tuple[int, ...]] = []
-        self.row: list[tuple[int, ...]] = []
-        self.column_part: list[list[int]] = []
-        self.row_part: list[list[int]] = []
+        self.place_of = np.full(symbolic.size, -1, dtype=np.int64)  # of block rows in the list at hand
+        self.source = np.full(symbolic.size, -1, dtype=np.int64)  # of blocks in the column at hand
+        self.first_block = symbolic.l_source[: symbolic.size]  # of A, on the diagonal
+        self.child_count = 0
+        self.item_source: list[IntArray] = []
+        self.item_place: list[IntArray] = []
+        self.child: list[IntArray] = []
+        self.late_row: list[IntArray] = []
+        self.column: list[IntArray] = []
+        self.column_lower: list[IntArray] = []
+        self.row: list[IntArray] = []
+        self.column_part: list[tuple[Table, Table]] = []  # number of each, and all of them
+        self.row_part: list[tuple[Table, Table]] = []
 
     def _place_updates(self) -> tuple[list[int], int]:
         """Memory of the updates, each of which is kept until the round of the panel above has read it."""
@@ -266,7 +270,7 @@ class _Writer:
         """All rounds."""
         items, late, columns, rows, lower = [0], [0], [0], [0], [0]
         for entry in self.rounds:
-            slot, begin = 0, len(self.item_source)
+            slot, begin, late_rows = 0, len(self.item_source), 0
             for p in entry.panels:
                 self._items(p, slot)
                 self._substitution(p)
@@ -274,18 +278,21 @@ class _Writer:
             for p, first, last in entry.updates:
                 self._late_items(p, slot, first, last)
                 slot += self.rows[p].size
-            late.append(len(self.late_row))
-            order = sorted(
-                range(begin, len(self.item_place)), key=lambda q: -(self.item_place[q][2] % PANEL_FIRST_STEP)
-            )
-            for table in (self.item_source, self.item_place):
-                table[begin:] = [table[q] for q in order]
-            items.append(len(self.item_source))
+                late_rows += self.rows[p].size
+            late.append(late[-1] + late_rows)
+            source, place = (np.concatenate(table[begin:]) for table in (self.item_source, self.item_place))
+            order = np.argsort(-(place[:, 2] % PANEL_FIRST_STEP), kind="stable")
+            self.item_source[begin:], self.item_place[begin:] = [source[order]], [place[order]]
+            items.append(items[-1] + len(order))
             if entry.panels:
-                columns.append(len(self.column))
-                rows.append(len(self.row))
-                sizes = [9 * len(self.groups[p]) * (len(self.groups[p]) + self.rows[p].size) for p in entry.panels]
-                lower.append(lower[-1] + sum(sizes))
+                width = [len(self.groups[p]) for p in entry.panels]
+                count = [self.rows[p].size for p in entry.panels]
+                columns.append(columns[-1] + sum(width))
+                rows.append(rows[-1] + sum(count))
+                lower.append(lower[-1] + sum(9 * k * (k + r) for k, r in zip(width, count, strict=True)))
+        largest = max(lower[-1], self.update_rows, self.child_count)
+        if largest > np.iinfo(np.int32).max:
+            raise OverflowError(f"the factor of a world has {largest} entries, more than its index can tell apart")
         widths = [
             max(len(self.groups[p]) for p in [*entry.panels, *(p for p, _, _ in entry.updates)])
             for entry in self.rounds
@@ -295,8 +302,8 @@ class _Writer:
         position[column[:, 0]] = np.arange(self.symbolic.size, dtype=np.int32)
         panel = self._panels()
         index = [self.rows[p] for entry in self.rounds for p in entry.panels]
-        parts = [*self.column_part, *self.row_part]
-        part_start = np.cumsum([0, *map(len, parts)])
+        counts, parts = zip(*self.column_part, *self.row_part, strict=True)
+        part_start = np.concatenate(([0], np.cumsum(np.concatenate(counts))))
         return Panels(
             size=self.symbolic.size,
             lower_rows=lower[-1],
@@ -304,7 +311,7 @@ class _Writer:
             round_count=len(self.rounds),
             turn_count=len(lower) - 1,
             column_limit=int(np.diff(columns).max(initial=0)),
-            row_count=len(self.row),
+            row_count=rows[-1],
             round_item=np.array(items, dtype=np.int32),
             round_width=np.array(widths, dtype=np.int32),
             round_late=np.array(late, dtype=np.int32),
@@ -324,83 +331,139 @@ class _Writer:
             row=_table(self.row, 4),
             row_part=part_start[len(column) :].astype(np.int32),
             row_index=position[np.concatenate([np.empty(0, dtype=np.int32), *index])],
-            part=np.array([place for places in parts for place in places], dtype=np.int32),
+            part=np.concatenate(parts).astype(np.int32),
         )
 
     def _panels(self) -> IntArray:
         """Panels in order of rounds."""
         sequence = [p for entry in self.rounds for p in entry.panels]
         number = {p: at for at, p in enumerate(sequence)} | {-1: -1}
-        values: list[tuple[int, ...]] = []
-        for p in sequence:
-            values.append((self.column_place[p], len(self.groups[p]), number[self.above[p]], self.rows[p].size))
-        return _table(values, 4)
+        values = [
+            (self.column_place[p], len(self.groups[p]), number[self.above[p]], self.rows[p].size) for p in sequence
+        ]
+        return np.array(values, dtype=np.int32).reshape(-1, 4)
 
     def _items(self, p: int, slot: int) -> None:
         """Items of a panel, whose first slot is ``slot``: inverse, triangle, rows below, and their update."""
-        group, below = self.groups[p], self.rows[p].tolist()
-        k, r = len(group), len(below)
+        group, below = np.array(self.groups[p], dtype=np.int64), self.rows[p].astype(np.int64)
+        k, r = group.size, below.size
         lower, inverse = self.lower_place[p], self.lower_place[p] + 9 * k * r
-        for t, j in enumerate(group):
-            pivot = slot + t + 2
-            for q in range(t + 1):
-                self.item_source.append((0, 0, PANEL_IDENTITY if q == t else -1, inverse + q * k + t))
-                self.item_place.append((slot + 1 + q, pivot, t + PANEL_FIRST_STEP * q, k * k))
-            for at, i in enumerate([*group[t:], *below], start=t - k):
-                begin, end = self._blocks_below(p, i, j)
-                place = lower + 9 * t * r + at if at >= 0 else -1
-                self.item_source.append((begin, end, self.source.get((i, j), -1), place))
-                self.item_place.append((slot + 2 + k + at, pivot, t, r))
-        if self.is_late[p]:
+        hull = np.concatenate((group, below))
+        source: list[IntArray] = []
+        place: list[IntArray] = []
+        i, j = np.tril_indices(k + r, m=k)  # row by row
+        column = np.lexsort((i, j))
+        i, j = i[column], j[column]
+        begin, end = self._blocks_below(p, hull[i], hull[j])
+        block = self._blocks_of(hull, group)[i, j]
+        last = 0
+        for t in range(k):
+            q = np.arange(t + 1)
+            source.append(_rows(0, 0, np.where(q == t, PANEL_IDENTITY, -1), inverse + q * k + t))
+            place.append(_rows(slot + 1 + q, slot + t + 2, t + PANEL_FIRST_STEP * q, k * k))
+            first, last = last, last + k + r - t
+            at = i[first:last] - k
+            target = np.where(at >= 0, lower + 9 * t * r + at, -1)
+            source.append(_rows(begin[first:last], end[first:last], block[first:last], target))
+            place.append(_rows(slot + 2 + k + at, slot + t + 2, t, r))
+        self.item_source += source
+        self.item_place += place
+        if not self.is_late[p]:
+            self._update_items(p, slot + 2 + k, 0, r * (r + 1) // 2)
+
+    def _update_items(self, p: int, slot: int, first: int, last: int) -> None:
+        """Items of a range of a panel's update, whose rows have the slots from ``slot`` on."""
+        below, k = self.rows[p], len(self.groups[p])
+        r = below.size
+        if first == last:
             return
-        update = self.update_place[p]
-        for a, b in _pairs(r):
-            begin, end = self._blocks_below(p, below[a], below[b])
-            self.item_source.append((begin, end, -1, update))
-            self.item_place.append((slot + 2 + k + a, slot + 2 + k + b, k + PANEL_UPDATE, r * (r + 1) // 2))
-            update += 1
+        a, b = _pairs(r, first, last)
+        begin, end = self._blocks_below(p, below[a], below[b])
+        self.item_source.append(_rows(begin, end, -1, self.update_place[p] + np.arange(first, last)))
+        self.item_place.append(_rows(slot + a, slot + b, k + PANEL_UPDATE, r * (r + 1) // 2))
 
     def _late_items(self, p: int, slot: int, first: int, last: int) -> None:
-        """Items of a range of a panel's update, whose rows have the slots from ``slot`` on."""
-        below, lower, k = self.rows[p].tolist(), self.lower_place[p], len(self.groups[p])
-        r = len(below)
-        for at, (a, b) in enumerate(_pairs(r)[first:last], start=first):
-            begin, end = self._blocks_below(p, below[a], below[b])
-            self.item_source.append((begin, end, -1, self.update_place[p] + at))
-            self.item_place.append((slot + a, slot + b, k + PANEL_UPDATE, r * (r + 1) // 2))
-        self.late_row += [(slot + a, lower + a, r, k) for a in range(r)]
+        """``_update_items`` of a round of its own, and what it reads of L."""
+        self._update_items(p, slot, first, last)
+        r, a = self.rows[p].size, np.arange(self.rows[p].size)
+        self.late_row.append(_rows(slot + a, self.lower_place[p] + a, r, len(self.groups[p])))
 
-    def _blocks_below(self, p: int, i: int, j: int) -> tuple[int, int]:
-        """Range of the updates of block (i, j) by the panels below a panel."""
-        begin = len(self.child)
+    def _blocks_of(self, hull: Table, group: Table) -> Table:
+        """Blocks of A that are blocks (hull, group) of L, or -1."""
+        symbolic = self.symbolic
+        blocks = np.full((hull.size, group.size), -1, dtype=np.int64)
+        for t, j in enumerate(group.tolist()):
+            begin, end = symbolic.col_start[j], symbolic.col_start[j + 1]
+            rows = symbolic.l_row[begin:end]
+            self.source[rows] = symbolic.l_source[begin:end]
+            self.source[j] = self.first_block[j]
+            blocks[:, t] = self.source[hull]
+            self.source[rows] = self.source[j] = -1
+        return blocks
+
+    def _met(self, p: int, i: Table) -> Iterator[tuple[int, Table]]:
+        """Panels below a panel, and where each has these block rows among its own, or -1."""
         for child in self.children[p]:
-            at, r = self.at[child], self.rows[child].size
-            if i in at and j in at:
-                a, b = at[i], at[j]
-                self.child.append((self.update_place[child] + b * r - b * (b - 1) // 2 + a - b, r * (r + 1) // 2))
-        return begin, len(self.child)
+            rows = self.rows[child]
+            self.place_of[rows] = np.arange(rows.size)
+            yield child, self.place_of[i]
+            self.place_of[rows] = -1
+
+    def _blocks_below(self, p: int, i: Table, j: Table) -> tuple[Table, Table]:
+        """Ranges of the updates of blocks (i, j) by the panels below a panel."""
+        block: list[Table] = [np.empty(0, dtype=np.int64)]
+        update: list[IntArray] = [np.empty((0, 2), dtype=np.int32)]
+        for child, at in self._met(p, np.stack((i, j))):
+            met = np.flatnonzero((at >= 0).all(axis=0))
+            (a, b), r = at[:, met], self.rows[child].size
+            block.append(met)
+            update.append(_rows(self.update_place[child] + b * r - b * (b - 1) // 2 + a - b, r * (r + 1) // 2))
+        blocks = np.concatenate(block)
+        self.child.append(np.concatenate(update)[np.argsort(blocks, kind="stable")])
+        end = self.child_count + np.cumsum(np.bincount(blocks, minlength=i.size))
+        begin = np.concatenate(([self.child_count], end[:-1]))[: i.size]
+        self.child_count += blocks.size
+        return begin, end
 
     def _substitution(self, p: int) -> None:
         """Columns and rows of a panel."""
-        group, below = self.groups[p], self.rows[p].tolist()
-        k, r, lower = len(group), len(below), self.lower_place[p]
-        for t, j in enumerate(group):
-            self.column.append((j, t, k, lower + 9 * k * r))
-            self.column_lower.append((lower, r, self.row_place[p], self.column_place[p]))
-            self.column_part.append(self._parts_below(p, j))
-        for at, i in enumerate(below):
-            self.row.append((lower + at, r, k, self.column_place[p]))
-            self.row_part.append(self._parts_below(p, i))
+        group, below = np.array(self.groups[p], dtype=np.int64), self.rows[p].astype(np.int64)
+        k, r, lower = group.size, below.size, self.lower_place[p]
+        self.column.append(_rows(group, np.arange(k), k, lower + 9 * k * r))
+        self.column_lower.append(_rows(np.full(k, lower), r, self.row_place[p], self.column_place[p]))
+        self.column_part.append(self._parts_below(p, group))
+        self.row.append(_rows(lower + np.arange(r), r, k, self.column_place[p]))
+        self.row_part.append(self._parts_below(p, below))
 
-    def _parts_below(self, p: int, i: int) -> list[int]:
-        """Rows of the panels below a panel that are the block row i."""
-        return [self.row_place[child] + self.at[child][i] for child in self.children[p] if i in self.at[child]]
+    def _parts_below(self, p: int, i: Table) -> tuple[Table, Table]:
+        """Number of the rows of panels below a panel that are block rows i, and these rows, one i after the other."""
+        index: list[Table] = [np.empty(0, dtype=np.int64)]
+        part: list[Table] = [np.empty(0, dtype=np.int64)]
+        for child, at in self._met(p, i):
+            met = np.flatnonzero(at >= 0)
+            index.append(met)
+            part.append(self.row_place[child] + at[met])
+        indices = np.concatenate(index)
+        return np.bincount(indices, minlength=i.size), np.concatenate(part)[np.argsort(indices, kind="stable")]
 
 
-def _pairs(count: int) -> list[tuple[int, int]]:
-    """Blocks of a lower triangle, column after column."""
-    return [(a, b) for b in range(count) for a in range(b, count)]
+def _pairs(count: int, first: int, last: int) -> tuple[Table, Table]:
+    """Rows and columns of a range of the blocks of a lower triangle, column after column."""
+    column = np.arange(count)
+    start = column * count - column * (column - 1) // 2
+    pair = np.arange(first, last)
+    b = np.searchsorted(start, pair, side="right") - 1
+    return pair - start[b] + b, b
 
 
-def _table(values: list[tuple[int, ...]], width: int) -> IntArray:
-    return np.array(values, dtype=np.int32).reshape(-1, width)
+def _rows(*values: Table | int) -> IntArray:
+    """Rows of a table, from its columns, the first of which is an array or, like the others, a number for all."""
+    count = max((value.size for value in values if isinstance(value, np.ndarray)), default=1)
+    rows = np.empty((count, len(values)), dtype=np.int32)
+    for n, value in enumerate(values):
+        rows[:, n] = value
+    return rows
+
+
+def _table(values: list[IntArray], width: int) -> IntArray:
+    return np.concatenate([np.empty((0, width), dtype=np.int32), *values])
