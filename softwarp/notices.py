@@ -13,6 +13,7 @@ import math
 import os
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -111,6 +112,34 @@ def progress(what: str, state: str) -> None:
 def progress_ends() -> None:
     """The work is done: its line goes."""
     _progress.end()
+
+
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """Meanwhile it is told that work goes on which cannot say how far it has come; as ``progress`` otherwise.
+
+    Args:
+        what: The work.
+    """
+    if not (_progress.is_told and are_shown()):
+        yield
+        return
+    is_over, begun = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        line, wait = Line(), WAIT_SECONDS
+        while not is_over.wait(wait):
+            line.show(f"{what}: {time.monotonic() - begun:.0f} s")
+            wait = RENEW_SECONDS
+        line.end()
+
+    teller = threading.Thread(target=tell, name="softwarp-working", daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        teller.join()
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs.common import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from softwarp import checks, interop
+from softwarp import checks, interop, notices
 from softwarp.builder import ModelBuilder, Precision
 from softwarp.envs import randomization
 from softwarp.envs.actions import ActionGuard
@@ -136,23 +136,24 @@ class SoftEnv(Hooks, Unpicklable, EnvBase):
 
     def make_simulation(self, num_worlds: int) -> Simulation:
         """A simulation of the scene with the options of ``config``."""
-        builder = ModelBuilder(gravity=self.gravity)
-        self.build_scene(builder)
-        if self.reduced_file is not None:
-            reduce_body(builder, self.reduced_file, turning=self.turns)
-        capacity = self.config.contact_capacity or self.contact_capacity
-        model = builder.finalize(num_worlds, str(self.device), cast("Precision", self.config.precision), capacity)
-        return Simulation(
-            model,
-            self.config.dt,
-            self.config.newton_iterations,
-            integrator=cast("Integrator", self.config.integrator),
-            solver_path=cast("SolverPath", self.config.solver_path),
-            contact_growth=self.config.contact_growth,
-            gauss_seidel_tolerance=self.sweep_tolerance,
-            contact_passes=self.contact_passes,
-            repeat_swing=self.repeat_swing,
-        )
+        with notices.working(f"building the scene of {type(self).__name__}"):
+            builder = ModelBuilder(gravity=self.gravity)
+            self.build_scene(builder)
+            if self.reduced_file is not None:
+                reduce_body(builder, self.reduced_file, turning=self.turns)
+            capacity = self.config.contact_capacity or self.contact_capacity
+            model = builder.finalize(num_worlds, str(self.device), cast("Precision", self.config.precision), capacity)
+            return Simulation(
+                model,
+                self.config.dt,
+                self.config.newton_iterations,
+                integrator=cast("Integrator", self.config.integrator),
+                solver_path=cast("SolverPath", self.config.solver_path),
+                contact_growth=self.config.contact_growth,
+                gauss_seidel_tolerance=self.sweep_tolerance,
+                contact_passes=self.contact_passes,
+                repeat_swing=self.repeat_swing,
+            )
 
     def hold_up(self, sim: Simulation, body: int, mass: float) -> None:
         """Let a rigid body of some mass [kg] hover, by a force that ``setup`` takes away when the rest has settled."""

@@ -54,30 +54,42 @@ def embed(
     low, high = bounding_box(x)
     allowed = max(float(np.linalg.norm(high - low)) * 1e-6 if tolerance is None else tolerance, snap)
 
-    corner = x[t]
-    lowest, highest = corner.min(axis=1) - allowed, corner.max(axis=1) + allowed
-    index, weights = np.zeros(len(p), dtype=np.int32), np.zeros((len(p), 4))
-    outside = []
-    for i, point in enumerate(p):
-        near = np.flatnonzero(((lowest <= point) & (point <= highest)).all(axis=1))
-        index[i], weights[i] = _deepest(corner, near, point)
-        if weights[i].min() < -ROUNDING:
-            outside.append(i)
+    index, weights = np.zeros(len(p), dtype=np.int32), np.full((len(p), 4), -1.0)
+    if len(p):
+        point, near = _boxes_with(x[t], p, allowed)
+        held, index_held, weights_held = _deepest(x[t], near, p, point)
+        index[held], weights[held] = index_held, weights_held
+    outside = np.flatnonzero(weights.min(axis=1) < -ROUNDING).tolist()
     if outside:
         _attach_outside(x, t, p, outside, index, weights, allowed, name)
     return index, weights
 
 
-def _deepest(corner: FloatArray, candidates: NDArray[Any], point: FloatArray) -> tuple[int, FloatArray]:
-    """The candidate with the largest smallest barycentric weight, and its weights; all -1 without a candidate."""
-    if candidates.size == 0:
-        return 0, np.full(4, -1.0)
+def _boxes_with(corner: FloatArray, points: FloatArray, margin: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Points and tetrahedra in whose boxes, wider by a margin on all sides, they lie, as pairs."""
+    from scipy.spatial import cKDTree  # 0.2 s
+
+    lowest, highest = corner.min(axis=1) - margin, corner.max(axis=1) + margin
+    middle, reach = 0.5 * (lowest + highest), 0.5 * (highest - lowest).max(axis=1)
+    found = cKDTree(points).query_ball_point(middle, reach * (1.0 + 1e-9), p=np.inf)  # cubes that hold the boxes
+    tet = np.repeat(np.arange(len(corner)), [len(some) for some in found])
+    point = np.concatenate([np.empty(0, dtype=np.int64), *filter(None, found)]).astype(np.int64)
+    within = ((lowest[tet] <= points[point]) & (points[point] <= highest[tet])).all(axis=1)
+    return point[within], tet[within]
+
+
+def _deepest(
+    corner: FloatArray, candidates: NDArray[Any], points: FloatArray, point: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], FloatArray]:
+    """Of every point's candidates the one with the largest smallest weight: points, tetrahedra, weights."""
     x = corner[candidates]
     edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)  # columns b - a, c - a, d - a
-    inner = np.linalg.solve(edges, (point - x[:, 0])[:, :, None])[:, :, 0]
+    inner = np.linalg.solve(edges, (points[point] - x[:, 0])[:, :, None])[:, :, 0]
     weights = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
-    best = int(weights.min(axis=1).argmax())
-    return int(candidates[best]), weights[best]
+    order = np.lexsort((candidates, -weights.min(axis=1), point))
+    held, first = np.unique(point[order], return_index=True)
+    best = order[first]
+    return held, candidates[best], weights[best]
 
 
 def _attach_outside(
@@ -101,7 +113,7 @@ def _attach_outside(
             continue
         # An edge or a corner is equally near to several triangles: of their tetrahedra, take the one least outside.
         tied = np.unique(owner[distance <= nearest * (1.0 + 1e-9) + 1e-15])
-        index[i], weights[i] = _deepest(x[t], tied, p[i])
+        at, index[at], weights[at] = _deepest(x[t], tied, p, np.full(tied.size, i))
     if refused:
         low, high = bounding_box(x)
         i, nearest = max(refused, key=lambda entry: entry[1])

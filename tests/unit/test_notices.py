@@ -146,3 +146,20 @@ def test_machines_without_a_gpu_are_not_told_so(capfd, caplog):
             2, b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. No GPU.\nWarp CUDA error 999: x\n"
         )
     assert capfd.readouterr().err == "before\nWarp CUDA error 999: x\n"
+
+
+def test_work_without_steps_is_told(monkeypatch, capfd):
+    """Of commands, if it takes long; errors pass, and no thread is left."""
+    monkeypatch.setattr(notices, "_is_terminal", lambda: True)
+    monkeypatch.setattr(notices, "WAIT_SECONDS", 0.1)
+    with notices.working("building"):
+        time.sleep(0.2)
+    with notices.telling(), notices.working("building"):
+        pass
+    assert capfd.readouterr().err == ""
+    with pytest.raises(ValueError, match="bad mesh"), notices.telling(), notices.working("building"):
+        time.sleep(0.3)
+        raise ValueError("bad mesh")
+    told = capfd.readouterr().err
+    assert told.startswith("\r\x1b[Kbuilding: 0 s") and told.endswith("\r\x1b[K")
+    assert "softwarp-working" not in {thread.name for thread in threading.enumerate()}
