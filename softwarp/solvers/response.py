@@ -326,7 +326,7 @@ class ContactResponse:
     def _solve_by_warps(self, structure: list[Any], inputs: list[Any], outputs: list[Any]) -> None:
         width = coulomb_tiers.WIDTH
         for tier in coulomb_tiers.tiers(self.variant, self.static_rows, self.capacity):
-            own = -(-self.static_rows // width), tier.own_contacts, tier.near_rows
+            own = -(-self.static_rows // width), tier.own_contacts, tier.near_rows, tier.near_unknowns
             kernel = coulomb_warp.kernels(self.variant, *own).gauss_seidel
             is_alone = tier.near_rows > 0 or self.width <= coulomb_warp.FEW_WORLDS
             block = width if is_alone else coulomb_warp.BLOCK
