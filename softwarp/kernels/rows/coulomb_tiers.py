@@ -9,7 +9,7 @@ from softwarp.kernels.algebra.lanes import Variant
 
 WIDTH = 32  # threads of a warp
 # Kernels with one world a block: contacts of a thread, bytes of shared memory for the matrix and for Newton's system
-NEAR = ((1, 8000, 16000), (1, 22000, 27000), (2, 28000, 21000), (2, 49152, 0))
+NEAR = ((1, 22000, 0), (2, 49152, 0), (2, 0, 37000))
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,10 @@ def tiers(variant: Variant, rows: int, capacity: int) -> list[Tier]:
         near_rows = (math.isqrt(8 * entries + 1) - 1) // 2
         unknowns = max(math.isqrt(spare // size + 1) - 1, 0)
         unknowns -= 1 - unknowns % 2 if unknowns else 0  # lines of an odd number of entries lie in banks of their own
-        most = min((near_rows - rows) // 3, WIDTH * own, capacity)
-        if most > above and near_rows >= rows:
-            found.append(Tier(above, most, own, near_rows, unknowns))
+        room = (near_rows - rows) // 3 if available else capacity
+        most = min(room, WIDTH * own, capacity)
+        if most > above and (near_rows >= rows or not available):
+            found.append(Tier(above, most, min(own, max(-(-most // WIDTH), 1)), near_rows, unknowns))
             above = most
     if above < capacity:
         found.append(Tier(above, capacity, max(-(-capacity // WIDTH), 1), 0))

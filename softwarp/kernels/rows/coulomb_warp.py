@@ -40,7 +40,7 @@ def kernels(
         own_rows: Static rows that a thread owns at most: row r belongs to thread r mod 32.
         own_contacts: Contacts that a thread owns at most, likewise.
         near_rows: Rows of W that fit into shared memory, which one world then has to itself; 0 for none.
-        near_unknowns: Unknowns up to which the system of Newton's method lies there too; needs ``near_rows``.
+        near_unknowns: Unknowns up to which the system of Newton's method lies there too; likewise.
     """
     real = variant.real
     module = variant.module(f"coulomb_warp_{own_rows}_{own_contacts}_{near_rows}_{near_unknowns}")
@@ -55,6 +55,8 @@ def kernels(
     follow = coulomb_warp_newton.functions(variant, own_rows, own_contacts, near_rows, near_unknowns).follow
     visits = warp_visits.functions(variant, own_rows, own_contacts, near_rows)
     visit_rows, visit_contacts = visits.visit_rows, visits.visit_contacts
+    is_alone, at_once = max(near_rows, near_unknowns) > 0, BLOCKS if own_contacts <= BLOCKS else BLOCKS // 2
+    bounds = (WIDTH, NEAR_BLOCKS) if is_alone else (BLOCK, at_once)
     owned = own_rows + 3 * own_contacts
     PerContact = wp.types.vector(own_contacts, real)
     Sums = wp.types.vector(2 * MEMORY, real)
@@ -466,11 +468,7 @@ def kernels(
         if thread == 0:
             residual[w, 0] = worst
 
-    @wp.kernel(
-        module=module,
-        enable_backward=False,
-        launch_bounds=(WIDTH, NEAR_BLOCKS) if near_rows else (BLOCK, BLOCKS if own_contacts <= BLOCKS else BLOCKS // 2),
-    )
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=bounds)
     def gauss_seidel(
         # Model
         bounded_row: wp.array(dtype=wp.int32),

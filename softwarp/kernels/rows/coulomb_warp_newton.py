@@ -257,9 +257,7 @@ def functions(
                         fill(system, line2, law, first, mu, n1, n2, begin + 2 * stride)
 
     @wp.func
-    def complete(
-        system: wp.uint64, right: real, extra: real, unknown: int, unknowns: int, stride: int
-    ):
+    def complete(system: wp.uint64, right: real, extra: real, unknown: int, unknowns: int, stride: int):
         """Diagonal, right side and least pivot of one line."""
         begin = stride * unknown
         pivot = got(system, begin + unknown) * real(wp.static(1.0 + DAMPING)) + extra

@@ -98,7 +98,9 @@ def test_a_gpu_sweeps_as_a_cpu_does(monkeypatch: pytest.MonkeyPatch, precision: 
         assert np.abs(slip[inside]).max(initial=0.0) < 1e-6
 
 
-@pytest.mark.parametrize("device", [pytest.param("cpu", marks=pytest.mark.slow), pytest.param("cuda:0", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize(
+    "device", [pytest.param("cpu", marks=pytest.mark.slow), pytest.param("cuda:0", marks=pytest.mark.cuda)]
+)
 def test_systems_in_shared_memory_have_the_same_solution(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     """Some of the systems of a solve are too large for it, others are not."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
