@@ -101,7 +101,7 @@ static SCALAR near[NEAR * (NEAR + 2)];
 #endif
 if (unknowns <= NEAR) return (wp::uint64)(size_t)near;
 #endif
-return (wp::uint64)(size_t)&wp::index(system, w, 0);
+return (wp::uint64)(size_t)&wp::index(system_out, w, 0);
 """
 
 
@@ -134,10 +134,11 @@ def functions(
     Numbers = Laws
 
     @wp.func_native(_PLACE.replace("SCALAR", name_of(real)).replace("NEAR", str(near_unknowns)))
-    def place_of(system: wp.array2d(dtype=real), w: int, unknowns: int) -> wp.uint64: ...
+    def place_of(system_out: wp.array2d(dtype=real), w: int, unknowns: int) -> wp.uint64:
+        """Address of the first line of a world's system."""
 
-    @wp.func_native(f"(({name_of(real)}*)system)[entry] = value;")
-    def put(system: wp.uint64, entry: int, value: real): ...
+    @wp.func_native(f"(({name_of(real)}*)system_out)[entry] = value;")
+    def put(system_out: wp.uint64, entry: int, value: real): ...
 
     @wp.func_native(f"return (({name_of(real)}*)system)[entry];")
     def got(system: wp.uint64, entry: int) -> real: ...
