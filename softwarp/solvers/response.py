@@ -7,6 +7,7 @@ without bounds), docs/theory/coulomb.md (Gauss-Seidel with friction).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,7 @@ from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.sides import sides_of
 from softwarp.solvers.subspace import Subspace
 from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.branches import Branches
 from softwarp.solvers.workspace.rows import Rows
 
 FEW_DOFS = 128  # of a world, up to which each looks through all contacts for those that touch it
@@ -172,6 +174,7 @@ class ContactResponse:
         self.inverse, self.curve = real(self.unbounded.size), real(capacity)
         self.everyone = rows.allocate(self.variant, world_count, 1, self.device, wp.int32)
         self.skipped = self.everyone
+        self.branches = Branches(self.device) if wp.get_device(self.device).is_cuda else None
 
     # Stages
 
@@ -325,13 +328,17 @@ class ContactResponse:
 
     def _solve_by_warps(self, structure: list[Any], inputs: list[Any], outputs: list[Any]) -> None:
         width = coulomb_tiers.WIDTH
-        for tier in coulomb_tiers.tiers(self.variant, self.static_rows, self.capacity):
-            own = -(-self.static_rows // width), tier.own_contacts, tier.near_rows
-            kernel = coulomb_warp.kernels(self.variant, *own).gauss_seidel
-            is_alone = tier.near_rows > 0 or self.width <= coulomb_warp.FEW_WORLDS
-            block = width if is_alone else coulomb_warp.BLOCK
-            given, dim = [*structure, tier.above, tier.most, *inputs], (self.width, width)
-            wp.launch(kernel, dim=dim, inputs=given, outputs=outputs, device=self.device, block_dim=block)
+        tiers = coulomb_tiers.tiers(self.variant, self.static_rows, self.capacity)
+        # Each waits for its slowest world. Further looks are in a part of a graph of their own, which has one branch
+        aside = len(tiers) if self.branches is not None and self.skipped is self.everyone else 1
+        with nullcontext([None]) if self.branches is None else self.branches.side_by_side(aside) as streams:
+            for number, tier in enumerate(tiers):
+                own = -(-self.static_rows // width), tier.own_contacts, tier.near_rows, tier.near_unknowns
+                kernel = coulomb_warp.kernels(self.variant, *own).gauss_seidel
+                is_alone = max(tier.near_rows, tier.near_unknowns) > 0 or self.width <= coulomb_warp.FEW_WORLDS
+                block, stream = width if is_alone else coulomb_warp.BLOCK, streams[number % aside]
+                given, dim = [*structure, tier.above, tier.most, *inputs], (self.width, width)
+                wp.launch(kernel, dim, given, outputs, device=self.device, stream=stream, block_dim=block)
 
     def _rows(self) -> list[wp.array]:
         c = self.contacts

@@ -25,11 +25,14 @@ from softwarp.kernels.rows.coulomb_warp_newton import GOES, LARGE, RESTS
 BLOCK = 128  # threads of a block; worlds in it do not wait for each other
 FEW_WORLDS = 512  # up to which a world has a block, and so a multiprocessor's cache, to itself
 ROOMY = 5  # contacts of a thread up to which it keeps what it knows of them in registers
+NEAR_BLOCKS = 1  # of one world each, likewise
 BLOCKS = 4  # at once on a multiprocessor, which bounds the registers of a thread
 
 
 @cache
-def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) -> SimpleNamespace:
+def kernels(
+    variant: Variant, own_rows: int, own_contacts: int, near_rows: int, near_unknowns: int = 0
+) -> SimpleNamespace:
     """Gauss-Seidel of the ``cuda`` variant for one scalar type.
 
     Args:
@@ -37,9 +40,10 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         own_rows: Static rows that a thread owns at most: row r belongs to thread r mod 32.
         own_contacts: Contacts that a thread owns at most, likewise.
         near_rows: Rows of W that fit into shared memory, which one world then has to itself; 0 for none.
+        near_unknowns: Unknowns up to which the system of Newton's method lies there too; likewise.
     """
     real = variant.real
-    module = variant.module(f"coulomb_warp_{own_rows}_{own_contacts}_{near_rows}")
+    module = variant.module(f"coulomb_warp_{own_rows}_{own_contacts}_{near_rows}_{near_unknowns}")
     module.options["fast_math"] = True  # divisions of the contact laws to 2 ulp; a quarter less time
     if own_contacts > ROOMY:  # too many for registers in any case
         module.options["max_unroll"] = 3
@@ -48,9 +52,11 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
     Owned, exchange, warp_sum, warp_max = share.Owned, share.exchange, share.warp_sum, share.warp_max
     load, store, bring_near = share.load, share.store, share.bring_near
     moved_gaps = share.moved_gaps
-    follow = coulomb_warp_newton.functions(variant, own_rows, own_contacts, near_rows).follow
+    follow = coulomb_warp_newton.functions(variant, own_rows, own_contacts, near_rows, near_unknowns).follow
     visits = warp_visits.functions(variant, own_rows, own_contacts, near_rows)
     visit_rows, visit_contacts = visits.visit_rows, visits.visit_contacts
+    is_alone, at_once = max(near_rows, near_unknowns) > 0, BLOCKS if own_contacts <= BLOCKS else BLOCKS // 2
+    bounds = (WIDTH, NEAR_BLOCKS) if is_alone else (BLOCK, at_once)
     owned = own_rows + 3 * own_contacts
     PerContact = wp.types.vector(own_contacts, real)
     Sums = wp.types.vector(2 * MEMORY, real)
@@ -462,11 +468,7 @@ def kernels(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) 
         if thread == 0:
             residual[w, 0] = worst
 
-    @wp.kernel(
-        module=module,
-        enable_backward=False,
-        launch_bounds=(WIDTH, 1) if near_rows else (BLOCK, BLOCKS if own_contacts <= BLOCKS else BLOCKS // 2),
-    )
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=bounds)
     def gauss_seidel(
         # Model
         bounded_row: wp.array(dtype=wp.int32),

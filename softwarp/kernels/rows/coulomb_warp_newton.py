@@ -1,7 +1,8 @@
 """Newton's method on the laws of a world's rows and contacts on a GPU: ``coulomb_newton`` for the threads of a warp.
 
-Every thread knows the laws, forces and gaps of what it owns. The system of a world lies in the device's memory, where
-threads fill the columns of what they own and then eliminate, a column each. Theory: docs/theory/coulomb.md.
+Every thread knows the laws, forces and gaps of what it owns. The system of a world lies in shared memory, or in the
+device's where it is too large for that; threads fill the columns of what they own and then eliminate, a column each.
+Theory: docs/theory/coulomb.md.
 """
 
 from functools import cache
@@ -17,14 +18,15 @@ from softwarp.kernels.rows.coulomb_tiers import WIDTH
 from softwarp.kernels.rows.warp_share import first_thread, meet, places, told_number
 
 MOST = 95  # rows of a system up to which it is solved: all worlds wait for the one that takes longest
+LINES = 4  # that are eliminated at a time, so that loads need not wait for each other
 TRIES = 10  # ways that are gone before a world goes on with the acceleration
 
 NONE, FIXED, LOW, HIGH, FREE, OPEN, BARE, STICK, SLIDE = range(9)  # no law that holds; those of rows, then of contacts
 GOES, RESTS, LOST, LARGE = range(4)  # what came of it: a way, nothing to solve, no solution, too many rows
 ENDLESS = 1.0e30
 
-# A line of the system: one entry per unknown, the right side, and behind the last one 1 / pivot. Four lines at a time,
-# so that loads need not wait for each other. Threads own columns; the solution ends in the column of the right side.
+# A line of the system: one entry per unknown, the right side, and behind the last one 1 / pivot. Threads own columns;
+# the solution ends in the column of the right side.
 _SOLVE = """
 #if defined(__CUDA_ARCH__)
 #define MEET __syncwarp();
@@ -35,7 +37,7 @@ static SCALAR slot;
 #define TELL(value, source) ({ if (thread == source) slot = value; MEET const SCALAR told = slot; MEET told; })
 #endif
 const int COLUMNS = MOST / 32 + 1;
-SCALAR* const a = &wp::index(system, w, 0);
+SCALAR* const a = (SCALAR*)system;
 const int parts = unknowns / 32 + 1;
 SCALAR top[COLUMNS];
 for (int k = 0; k < unknowns; ++k) {
@@ -46,17 +48,17 @@ for (int k = 0; k < unknowns; ++k) {
         const int c = thread + 32 * m;
         top[m] = m < parts && c > k && c <= unknowns ? pivots[c] * inverse : (SCALAR)0;
     }
-    for (int r = k + 1; r < unknowns; r += 4) {
+    for (int r = k + 1; r < unknowns; r += LINES) {
         SCALAR* const line = a + r * stride;
-        const int last = unknowns - r < 4 ? unknowns - r : 4;
-        SCALAR factor[4];
-        for (int i = 0; i < 4; ++i) factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
+        const int last = unknowns - r < LINES ? unknowns - r : LINES;
+        SCALAR factor[LINES];
+        for (int i = 0; i < LINES; ++i) factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
         for (int m = 0; m < COLUMNS; ++m) {
             const int c = thread + 32 * m;
             if (m >= parts || c <= k || c > unknowns) continue;
-            SCALAR entry[4];
-            for (int i = 0; i < 4; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
-            for (int i = 0; i < 4; ++i) if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m];
+            SCALAR entry[LINES];
+            for (int i = 0; i < LINES; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
+            for (int i = 0; i < LINES; ++i) if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m];
         }
     }
     MEET
@@ -89,6 +91,19 @@ MEET
 return total;
 """
 
+# Where the system lies: in memory that the threads of a block share, if it fits there.
+_PLACE = """
+#if NEAR > 0
+#if defined(__CUDA_ARCH__)
+__shared__ SCALAR near[NEAR * (NEAR + 2)];
+#else
+static SCALAR near[NEAR * (NEAR + 2)];
+#endif
+if (unknowns <= NEAR) return (wp::uint64)(size_t)near;
+#endif
+return (wp::uint64)(size_t)&wp::index(system_out, w, 0);
+"""
+
 
 def stride_of(rows: int) -> int:
     """Entries of a line of the system of a world with so many rows: unknowns, right side, reciprocal pivot."""
@@ -101,8 +116,13 @@ def entries(rows: int) -> int:
 
 
 @cache
-def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int) -> SimpleNamespace:
-    """``follow`` for one scalar type of the ``cuda`` variant; the other arguments are those of ``warp_share``."""
+def functions(
+    variant: Variant, own_rows: int, own_contacts: int, near_rows: int, near_unknowns: int
+) -> SimpleNamespace:
+    """``follow`` for one scalar type of the ``cuda`` variant; the other arguments are those of ``warp_share``.
+
+    Systems of up to ``near_unknowns`` lie in shared memory, which one world then has to itself.
+    """
     real = variant.real
     share = warp_share.functions(variant, own_rows, own_contacts, near_rows)
     Owned, told, column, moved_gaps = share.Owned, share.told, share.column, share.moved_gaps
@@ -113,8 +133,18 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
     first_contact = max(own_rows, 1)
     Numbers = Laws
 
-    @wp.func_native(_SOLVE.replace("SCALAR", name_of(real)).replace("MOST", str(MOST)))
-    def solve(system: wp.array2d(dtype=real), w: int, thread: int, unknowns: int, stride: int) -> real:
+    @wp.func_native(_PLACE.replace("SCALAR", name_of(real)).replace("NEAR", str(near_unknowns)))
+    def place_of(system_out: wp.array2d(dtype=real), w: int, unknowns: int) -> wp.uint64:
+        """Address of the first line of a world's system."""
+
+    @wp.func_native(f"(({name_of(real)}*)system_out)[entry] = value;")
+    def put(system_out: wp.uint64, entry: int, value: real): ...
+
+    @wp.func_native(f"return (({name_of(real)}*)system)[entry];")
+    def got(system: wp.uint64, entry: int) -> real: ...
+
+    @wp.func_native(_SOLVE.replace("SCALAR", name_of(real)).replace("MOST", str(MOST)).replace("LINES", str(LINES)))
+    def solve(system: wp.uint64, thread: int, unknowns: int, stride: int) -> real:
         """Solve the system; the sum of the solution, which is endless where one of its numbers is."""
 
     @wp.func
@@ -152,36 +182,35 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
 
     @wp.func
     def fill(
-        system: wp.array2d(dtype=real),
+        system: wp.uint64,
         line: Owned,
         law: Laws,
         first: Numbers,
         mu: PerContact,
         n1: PerContact,
         n2: PerContact,
-        w: int,
         begin: int,
     ):
         """Write what the thread owns of a line, which begins at ``begin`` and has one entry of W per row."""
         for k in range(wp.static(own_rows)):
             if law[k] > wp.static(FIXED):
-                system[w, begin + first[k]] = line[k]
+                put(system, begin + first[k], line[k])
         for k in range(wp.static(own_contacts)):
             e = wp.static(own_rows) + 3 * k
             kind = law[wp.static(first_contact) + k]
             place = begin + first[wp.static(first_contact) + k]
             if kind == wp.static(SLIDE):
-                system[w, place] = line[e] + mu[k] * (n1[k] * line[e + 1] + n2[k] * line[e + 2])
-                system[w, place + 1] = n1[k] * line[e + 2] - n2[k] * line[e + 1]
+                put(system, place, line[e] + mu[k] * (n1[k] * line[e + 1] + n2[k] * line[e + 2]))
+                put(system, place + 1, n1[k] * line[e + 2] - n2[k] * line[e + 1])
             elif kind > wp.static(OPEN):
-                system[w, place] = line[e]
+                put(system, place, line[e])
                 if kind == wp.static(STICK):
-                    system[w, place + 1] = line[e + 1]
-                    system[w, place + 2] = line[e + 2]
+                    put(system, place + 1, line[e + 1])
+                    put(system, place + 2, line[e + 2])
 
     @wp.func
     def fill_all(
-        system: wp.array2d(dtype=real),
+        system: wp.uint64,
         delassus: wp.array2d(dtype=real),
         law: Laws,
         first: Numbers,
@@ -205,7 +234,7 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 if is_left:
                     begin = stride * told_number(first[k], owner)
                     line = column(delassus, w, order, owner + wp.static(WIDTH) * k, thread, rows, count)
-                    fill(system, line, law, first, mu, n1, n2, w, begin)
+                    fill(system, line, law, first, mu, n1, n2, begin)
         for k in range(wp.static(own_contacts)):
             owner = int(-1)
             is_left = bool(True)
@@ -221,23 +250,21 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                     line0 = column(delassus, w, order, j, thread, rows, count)
                     line1 = column(delassus, w, order, j + 1, thread, rows, count)
                     line2 = column(delassus, w, order, j + 2, thread, rows, count)
-                    fill(system, line0, law, first, mu, n1, n2, w, begin)
+                    fill(system, line0, law, first, mu, n1, n2, begin)
                     if kind == wp.static(SLIDE):
-                        fill(system, line1 * c1 + line2 * c2, law, first, mu, n1, n2, w, begin + stride)
+                        fill(system, line1 * c1 + line2 * c2, law, first, mu, n1, n2, begin + stride)
                     if kind == wp.static(STICK):
-                        fill(system, line1, law, first, mu, n1, n2, w, begin + stride)
-                        fill(system, line2, law, first, mu, n1, n2, w, begin + 2 * stride)
+                        fill(system, line1, law, first, mu, n1, n2, begin + stride)
+                        fill(system, line2, law, first, mu, n1, n2, begin + 2 * stride)
 
     @wp.func
-    def complete(
-        system: wp.array2d(dtype=real), right: real, extra: real, w: int, unknown: int, unknowns: int, stride: int
-    ):
+    def complete(system: wp.uint64, right: real, extra: real, unknown: int, unknowns: int, stride: int):
         """Diagonal, right side and least pivot of one line."""
         begin = stride * unknown
-        pivot = system[w, begin + unknown] * real(wp.static(1.0 + DAMPING)) + extra
-        system[w, begin + unknown] = pivot
-        system[w, begin + unknowns] = right
-        system[w, begin + unknowns + 1] = wp.abs(pivot) * real(wp.static(PIVOT))
+        pivot = got(system, begin + unknown) * real(wp.static(1.0 + DAMPING)) + extra
+        put(system, begin + unknown, pivot)
+        put(system, begin + unknowns, right)
+        put(system, begin + unknowns + 1, wp.abs(pivot) * real(wp.static(PIVOT)))
 
     @wp.func
     def lead_warp(
@@ -323,8 +350,10 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 if unknowns == 0:
                     break
 
+                lines = place_of(system, w, unknowns)
+                pitch = wp.where(unknowns <= wp.static(near_unknowns), wp.static(near_unknowns + 2), stride)
                 meet()
-                fill_all(system, delassus, law, first, mu, n1, n2, w, thread, order, rows, count, stride)
+                fill_all(lines, delassus, law, first, mu, n1, n2, w, thread, order, rows, count, pitch)
                 for k in range(wp.static(own_rows)):
                     if law[k] > wp.static(FIXED):
                         row = thread + wp.static(WIDTH) * k
@@ -336,21 +365,21 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                         if law[k] == wp.static(HIGH):
                             stop = ceiling[w, row]
                             give = real(0.0)
-                        complete(system, stop - slack[k] - give * value[k], give, w, first[k], unknowns, stride)
+                        complete(lines, stop - slack[k] - give * value[k], give, first[k], unknowns, pitch)
                 for k in range(wp.static(own_contacts)):
                     e = wp.static(own_rows) + 3 * k
                     kind = law[wp.static(first_contact) + k]
                     u = first[wp.static(first_contact) + k]
                     if kind > wp.static(OPEN):
-                        complete(system, -(slack[e] + soft[k] * value[e]), soft[k], w, u, unknowns, stride)
+                        complete(lines, -(slack[e] + soft[k] * value[e]), soft[k], u, unknowns, pitch)
                     if kind == wp.static(STICK):
-                        complete(system, -slack[e + 1], real(0.0), w, u + 1, unknowns, stride)
-                        complete(system, -slack[e + 2], real(0.0), w, u + 2, unknowns, stride)
+                        complete(lines, -slack[e + 1], real(0.0), u + 1, unknowns, pitch)
+                        complete(lines, -slack[e + 2], real(0.0), u + 2, unknowns, pitch)
                     if kind == wp.static(SLIDE):
                         slip = n2[k] * slack[e + 1] - n1[k] * slack[e + 2]
-                        complete(system, slip, turn[k], w, u + 1, unknowns, stride)
+                        complete(lines, slip, turn[k], u + 1, unknowns, pitch)
                 meet()
-                total = solve(system, w, thread, unknowns, stride)
+                total = solve(lines, thread, unknowns, pitch)
                 if not (wp.abs(total) < real(wp.static(ENDLESS))):
                     verdict = int(LOST)
                     break
@@ -362,7 +391,7 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 turned = int(FIXED)
                 for k in range(wp.static(own_rows)):
                     if law[k] > wp.static(FIXED):
-                        step[k] = system[w, stride * first[k] + unknowns]
+                        step[k] = got(lines, pitch * first[k] + unknowns)
                     if law[k] == wp.static(FREE) and step[k] != real(0.0):
                         row = thread + wp.static(WIDTH) * k
                         limit = (wp.where(step[k] > real(0.0), upper[w, row], lower[w, row]) - value[k]) / step[k]
@@ -373,14 +402,14 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 for k in range(wp.static(own_contacts)):
                     e = wp.static(own_rows) + 3 * k
                     kind = law[wp.static(first_contact) + k]
-                    place = stride * first[wp.static(first_contact) + k] + unknowns
+                    place = pitch * first[wp.static(first_contact) + k] + unknowns
                     if kind > wp.static(OPEN):
-                        step[e] = system[w, place]
+                        step[e] = got(lines, place)
                         if kind == wp.static(STICK):
-                            step[e + 1] = system[w, place + stride]
-                            step[e + 2] = system[w, place + 2 * stride]
+                            step[e + 1] = got(lines, place + pitch)
+                            step[e + 2] = got(lines, place + 2 * pitch)
                         if kind == wp.static(SLIDE):
-                            across = system[w, place + stride]
+                            across = got(lines, place + pitch)
                             step[e + 1] = mu[k] * n1[k] * step[e] - n2[k] * across
                             step[e + 2] = mu[k] * n2[k] * step[e] + n1[k] * across
                         if step[e] < real(0.0) and value[e] < -share_gone * step[e]:

@@ -32,7 +32,7 @@ class Case:
 
 
 def swept(
-    case: Case, precision: str, sweeps: int, *, near: int | None, device: str = "cpu"
+    case: Case, precision: str, sweeps: int, *, near: int | None, device: str = "cpu", unknowns: int = 0
 ) -> tuple[Array, Array, Array, float]:
     """Multipliers of rows and contacts, gaps and residual after ``sweeps``: a CPU's, or a GPU's with ``near`` rows."""
     real = wp.float64 if precision == "float64" else wp.float32
@@ -56,7 +56,7 @@ def swept(
         outputs = [multiplier, force, change, zeros(count), history, zeros(anderson.GRAM), residual]
         wp.launch(kernel, dim=1, inputs=[bounded, rows, order, *limits, *inputs], outputs=outputs, device=device)
     else:
-        own = -(-rows // 32), -(-count // 32), near
+        own = -(-rows // 32), -(-count // 32), near, unknowns
         kernel = coulomb_warp.kernels(lanes.variant("cuda", precision), *own).gauss_seidel
         structure = [bounded, rows, order, -1, count, *limits, coulomb_warp_newton.stride_of(order)]
         structure.append(wp.zeros((1, 1), dtype=wp.int32, device=device))
@@ -96,6 +96,18 @@ def test_a_gpu_sweeps_as_a_cpu_does(monkeypatch: pytest.MonkeyPatch, precision: 
         assert rubs.any() and np.all(np.linalg.norm(friction, axis=1) <= case.mu * press * (1.0 + 1e-5))
         inside = rubs & (np.linalg.norm(friction, axis=1) < 0.99 * case.mu * press)
         assert np.abs(slip[inside]).max(initial=0.0) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "device", [pytest.param("cpu", marks=pytest.mark.slow), pytest.param("cuda:0", marks=pytest.mark.cuda)]
+)
+def test_systems_in_shared_memory_have_the_same_solution(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    """Some of the systems of a solve are too large for it, others are not."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    for case in (Case(4, 12, 20), DrawnPlate(7)):
+        near, far = (swept(case, "float32", 25, near=80, device=device, unknowns=unknowns) for unknowns in (33, 0))
+        for mine, other in zip(near, far, strict=True):
+            assert mine == pytest.approx(other, rel=1e-6, abs=1e-9)
 
 
 class DrawnPlate(Case):
