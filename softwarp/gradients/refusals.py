@@ -85,11 +85,6 @@ def _resting_frames(sim: Simulation) -> Iterator[str]:
 
 def _options(sim: Simulation) -> Iterator[str]:
     options = sim.options
-    frames = sim.model.frames
-    if options.integrator == "trapezoidal" and sim.model.row_count == 0 and sim.model.contact is None and frames:
-        if frames.carried_count:
-            told = "rods and rigid bodies that carry something have no gradient with integrator 'trapezoidal' yet"
-            yield f"{told}; take integrator='bdf2' or 'euler'"
     if options.repeat_swing < float("inf"):
         told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
         yield f"{told} have no gradient yet; take repeat_swing=inf"

@@ -154,7 +154,8 @@ class SecondOrderAdjoint:
         rests = [self.rests[name] for name in FRAMES]
         for rest in rests:
             rest.zero_()
-        inputs = [stage.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0], stepper.rough]
+        inputs = [stage.factor, s.lanes, frames.frame_master, frames.frame_spin, stepper.told]
+        inputs += [starts[0], ends[0], stepper.rough]
         s.each_real(self.k_frames.part_frames, frames.count, inputs, [*bars, *rests])
         if of_stage is not None:
             of_stage.more_share.zero()
