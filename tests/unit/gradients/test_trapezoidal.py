@@ -108,6 +108,7 @@ def test_what_rods_and_bodies_carry(base: str, relaxes: bool, options: dict[str,
     if relaxes:  # else differences are rounding
         sizes["parameters"]["relaxation_ratio"] *= 100.0
         sizes["parameters"]["relaxation_time"] *= 100.0
+        sizes["parameters"]["rayleigh_stiffness"] *= 30.0
     check_frames(Rollout(sim), given, test_every_input.loss, sizes)
     if not options:
         compare(Rollout(sim), given, test_every_input.loss)
