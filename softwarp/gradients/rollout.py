@@ -88,8 +88,6 @@ class Rollout:
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         rest = checks.flag(rest, "gradients.Rollout: rest")
         require_differentiable(sim)
-        if rest and sim.options.integrator != "euler":
-            raise ValueError("gradients.Rollout: rest shapes have gradients with integrator='euler' only")
         if rest and sim.model.has_moving_frames:
             told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")

@@ -388,7 +388,7 @@ def _adjoint(
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
         of_stages = SecondOrderAdjoint if steps.stages is BDF2 else TrapezoidalAdjoint
-        return of_stages(steps, gradients, index)
+        return of_stages(steps, gradients, index, rest=rest)
     if steps.control is not None:
         return NewtonAdjoint(steps, gradients, index, rest=rest)
     if steps.system.model.joints is not None:

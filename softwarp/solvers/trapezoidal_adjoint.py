@@ -43,14 +43,15 @@ class LaterAdjoint(StageAdjoint):
         step: Takes the stage; its system has the state that it starts from.
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
     """
 
     follows = 0.0
 
-    def __init__(self, step: PredictedEuler, gradients: Gradients, index: AdjointIndex) -> None:
-        super().__init__(step.system, step.h, step.pace, self._recall, gradients, index)
+    def __init__(self, step: PredictedEuler, gradients: Gradients, index: AdjointIndex, *, rest: bool) -> None:
+        super().__init__(step.system, step.h, step.pace, self._recall, gradients, index, rest=rest)
         self.found_v = self.shard.rows(self.shard.dof_room)
-        self.earlier = EarlierAdjoint(step.system, step.h, step.pace, step.predict, gradients, index)
+        self.earlier = EarlierAdjoint(step.system, step.h, step.pace, step.predict, gradients, index, rest=rest)
         self.earlier.later = self
         names = [*STATE, *FRAMES, *MEMORIES]
         names += [field.name for field in fields(gradients) if field.name.startswith("command_")]
@@ -84,8 +85,8 @@ class LaterAdjoint(StageAdjoint):
 class TrapezoidalAdjoint(SecondOrderAdjoint):
     """Pulls gradients by the end of a step of the trapezoidal rule back to its start; see ``SecondOrderAdjoint``."""
 
-    def __init__(self, stepper: SecondOrder, gradients: Gradients, index: AdjointIndex) -> None:
-        super().__init__(stepper, gradients, index)
+    def __init__(self, stepper: SecondOrder, gradients: Gradients, index: AdjointIndex, *, rest: bool = False) -> None:
+        super().__init__(stepper, gradients, index, rest=rest)
         device = stepper.shard.device
         self.starts, self.stops = (
             [
@@ -102,7 +103,7 @@ class TrapezoidalAdjoint(SecondOrderAdjoint):
 
     def _stage(self, step: ImplicitEuler | PredictedEuler, index: AdjointIndex) -> StepAdjoint:
         if isinstance(step, PredictedEuler):
-            return LaterAdjoint(step, self.gradients, index)
+            return LaterAdjoint(step, self.gradients, index, rest=self.rest)
         return super()._stage(step, index)
 
     def _step(self, *, parameters: bool) -> None:

@@ -94,6 +94,33 @@ def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.
     assert abs(derivative - expected) <= 1e-6 * abs(expected)
 
 
+@pytest.mark.parametrize(
+    ("beside", "integrator", "options"),
+    [
+        pytest.param("cable", "bdf2", {}, id="bdf2"),
+        pytest.param("cable", "bdf2", NEWTON, id="bdf2, solved", marks=pytest.mark.slow),
+        pytest.param("branch", "bdf2", {}, id="memory"),
+        pytest.param("nothing", "trapezoidal", {}, id="trapezoidal"),
+        pytest.param("nothing", "trapezoidal", NEWTON, id="trapezoidal, solved", marks=pytest.mark.slow),
+        pytest.param("ball", "bdf2", {"contact_passes": 0}, id="contact"),
+        pytest.param("ball", "bdf2", {"contact_passes": 1}, id="a look"),
+        pytest.param("ball", "bdf2", NEWTON, id="contact, solved", marks=pytest.mark.slow),
+    ],
+)
+def test_steps_of_second_order(beside: str, integrator: str, options: dict[str, Any]) -> None:
+    """Every stage adds its own; beside contact they are rough ones."""
+
+    def found(rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tensor:
+        return stepped(beam_beside(beside, False, rest, integrator=integrator, **options), START, leaf)
+
+    leaf = torch.tensor(REST).requires_grad_()
+    found(REST, leaf).backward()
+    assert leaf.grad is not None
+    derivative = float((leaf.grad * torch.tensor(CHANGE)).sum())
+    ahead, back = (float(found(REST + way * CHANGE, None)) for way in (1.0, -1.0))
+    assert abs(derivative - 0.5 * (ahead - back)) <= 1e-6 * abs(derivative)
+
+
 @pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("beside", ["ball", "branch"])
 def test_contacts_and_memories(beside: str, newton: bool) -> None:
@@ -106,19 +133,20 @@ def test_contacts_and_memories(beside: str, newton: bool) -> None:
     assert abs(derivative - 0.5 * (ahead - back)) <= 1e-6 * abs(derivative)
 
 
-def beam_beside(beside: str, newton: bool, rest: np.ndarray) -> sw.Simulation:
-    """The beam with one elastic cable, with a memory or on a ball."""
+def beam_beside(beside: str, newton: bool, rest: np.ndarray, **more: Any) -> sw.Simulation:
+    """The beam with one elastic cable, with a memory or on a ball, or with neither; or with ``nothing`` at all."""
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     memory = (0.3, 0.05) if beside == "branch" else (0.0, 0.0)
     mesh, stuff = replace(MESH, nodes=rest), material("large", 1e5, 0.4)
     body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory)
     builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
-    builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
+    if beside != "nothing":
+        builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
     if beside == "ball":
         ball = builder.add_rigid(sw.Sphere(0.02), kinematic=True, pose=(0.09, 0.02, -0.0195))
         builder.add_contact(body, ball, mu=0.4)
     found = {"gauss_seidel_iterations": 3000, "gauss_seidel_tolerance": 1e-14}
-    options = {**found, **(NEWTON if newton else {})}
+    options = {**found, **(NEWTON if newton else {}), **more}
     sim = sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01, **options)
     sim.control.cable_displacement[...] = 0.004
     return sim
