@@ -21,10 +21,10 @@ def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _reduced(sim), _contacts(sim))
     is_linear = sim.options.newton_iterations == 1
-    if sim.options.pressure_tangent and is_linear and sim.model.has_moving_frames:
-        told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
+    if sim.options.pressure_tangent and is_linear and sim.model.joints is not None:
+        told = "the tangent of pressures has no gradient beside joints"
         return f"{told}; take pressure_tangent=False"
-    return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator != "euler" else ()), None)
+    return next(parts, None)
 
 
 def require_differentiable(sim: Simulation) -> None:
@@ -88,13 +88,6 @@ def _options(sim: Simulation) -> Iterator[str]:
     if options.repeat_swing < float("inf"):
         told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
         yield f"{told} have no gradient yet; take repeat_swing=inf"
-
-
-def _second_order(sim: Simulation) -> Iterator[str]:
-    """What steps of ``bdf2`` have no gradient with."""
-    told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
-    if sim.options.pressure_tangent and sim.options.newton_iterations == 1:
-        yield f"the tangent of pressures {told}, or pressure_tangent=False"
 
 
 SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)
