@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def missing(sim: Simulation) -> str | None:
     parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _reduced(sim), _contacts(sim))
     is_linear = sim.options.newton_iterations == 1
     if sim.options.pressure_tangent and is_linear and sim.model.joints is not None:
-        told = "the tangent of pressures has no gradient beside joints"
+        told = "the tangent of pressures has no gradient beside joints yet"
         return f"{told}; take pressure_tangent=False"
     return next(parts, None)
 
@@ -35,16 +35,6 @@ def require_differentiable(sim: Simulation) -> None:
     """
     if found := missing(sim):
         raise ValueError(f"gradients.Rollout: {found}; or fit without gradients, by softwarp.identification")
-
-
-def require_directions(sim: Simulation, names: Iterable[str]) -> None:
-    """Check that slopes of tensors, named ``params.youngs`` and so on, can be pushed through steps.
-
-    Raises:
-        ValueError: Naming what cannot, and the way out.
-    """
-    if "params.rest_x" in names:
-        raise ValueError("gradients.jvp: rest shapes have no forward mode yet; take backward()")
 
 
 def require_static_gradient(sim: Simulation) -> None:

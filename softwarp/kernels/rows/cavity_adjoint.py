@@ -250,8 +250,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gradient by the vector s of one surface edge, with which the tangent of pressures has blocks [s]x in A.
 
-        A block (i, j) and its transpose give -p . A u the part -s . (u_j x p_i + p_j x u_i), with the unknowns u = v - v0
-        of a step that is linearised with the velocities v0.
+        A block (i, j) and its transpose give -p . A u the part -s . (u_j x p_i + p_j x u_i), with the unknowns
+        u = v - v0 of a step that is linearised with the velocities v0.
         """
         pack, edge, lane = wp.tid()
         total = vec3()

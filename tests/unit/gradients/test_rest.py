@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.gradients import Equilibrium, Rollout
+from softwarp.gradients import Equilibrium, Rollout, States, jvp
 from tests.cases import material
 from tests.gradient_cases import cube
 from tests.unit.gradients.test_equilibrium import beam
@@ -24,6 +25,7 @@ START = torch.tensor(REST + 3e-4 * RNG.standard_normal(REST.shape))[None]
 SPEED = torch.tensor(0.05 * RNG.standard_normal(REST.shape))[None]
 WEIGHT = torch.tensor(RNG.standard_normal(REST.shape))[None]
 NEWTON: dict[str, Any] = {"newton_iterations": 60, "newton_tolerance": 1e-13}
+SLOW = pytest.mark.slow
 LAWS = ["large", "nh_log", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot", "ogden"))]
 
 
@@ -119,6 +121,46 @@ def test_steps_of_second_order(beside: str, integrator: str, options: dict[str, 
     derivative = float((leaf.grad * torch.tensor(CHANGE)).sum())
     ahead, back = (float(found(REST + way * CHANGE, None)) for way in (1.0, -1.0))
     assert abs(derivative - 0.5 * (ahead - back)) <= 1e-6 * abs(derivative)
+
+
+@pytest.mark.parametrize(
+    ("beside", "options"),
+    [("cable", {}), ("ball", {}), ("cable", {"integrator": "bdf2"}), pytest.param("cable", NEWTON, marks=[SLOW])],
+)
+def test_both_modes_agree(beside: str, options: dict[str, Any]) -> None:
+    """To rounding, by two directions at once, one of them of moduli and velocities too, and by dual tensors."""
+    sim = beam_beside(beside, False, REST, **options)
+    rollout, shape = Rollout(sim, rest=True), torch.tensor(REST)
+    leaves = [shape.clone(), sim.params.youngs.clone(), SPEED.clone()]
+    for leaf in leaves:
+        leaf.requires_grad_()
+
+    def run(rest: torch.Tensor, youngs: torch.Tensor, v: torch.Tensor) -> States:
+        return rollout({"node_x": START, "node_v": v}, parameters={"rest_x": rest, "youngs": youngs}, steps=3)
+
+    def weighed(states: States) -> torch.Tensor:
+        return ((states.node_x + states.node_v) * WEIGHT).sum() + 0.01 * states.cable_tension.sum()
+
+    weighed(run(*leaves)).backward()
+    along = torch.stack([torch.tensor(CHANGE), 3.0 * torch.tensor(CHANGE).roll(1, 0)])
+    others = torch.tensor([0.0, 1.0]).reshape(2, 1, 1).double()
+    directions = [along, others, others[..., None] * SPEED]
+    _, slopes = jvp(
+        rollout,
+        {"parameters": dict(zip(("rest_x", "youngs"), directions, strict=False)), "state": {"node_v": directions[2]}},
+        {"node_x": START, "node_v": SPEED},
+        parameters={"rest_x": shape},
+        steps=3,
+    )
+    for number in range(2):
+        terms = [(leaf.grad * way[number]).flatten() for leaf, way in zip(leaves, directions, strict=True)]
+        backward, scale = sum(term.sum() for term in terms), sum(term.abs().sum() for term in terms)
+        one = replace(slopes, **{name: getattr(slopes, name)[number] for name in ("node_x", "node_v", "cable_tension")})
+        assert abs(float(weighed(one)) - float(backward)) <= 1e-10 * float(scale)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(shape, along[0])
+        found = run(dual, sim.params.youngs, SPEED)
+        assert torch.equal(forward_ad.unpack_dual(found.node_x).tangent, slopes.node_x[0])
 
 
 @pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
