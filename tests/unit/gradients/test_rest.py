@@ -175,7 +175,7 @@ def test_contacts_and_memories(beside: str, newton: bool) -> None:
     assert abs(derivative - 0.5 * (ahead - back)) <= 1e-6 * abs(derivative)
 
 
-def beam_beside(beside: str, newton: bool, rest: np.ndarray, **more: Any) -> sw.Simulation:
+def beam_beside(beside: str, newton: bool, rest: np.ndarray, num_worlds: int = 1, **more: Any) -> sw.Simulation:
     """The beam with one elastic cable, with a memory or on a ball, or with neither; or with ``nothing`` at all."""
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     memory = (0.3, 0.05) if beside == "branch" else (0.0, 0.0)
@@ -189,9 +189,31 @@ def beam_beside(beside: str, newton: bool, rest: np.ndarray, **more: Any) -> sw.
         builder.add_contact(body, ball, mu=0.4)
     found = {"gauss_seidel_iterations": 3000, "gauss_seidel_tolerance": 1e-14}
     options = {**found, **(NEWTON if newton else {}), **more}
-    sim = sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01, **options)
+    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), dt=0.01, **options)
     sim.control.cable_displacement[...] = 0.004
     return sim
+
+
+@pytest.mark.parametrize("options", [{}, {"integrator": "bdf2"}], ids=["euler", "bdf2"])
+def test_worlds_beside_change_no_bit(options: dict[str, Any]) -> None:
+    """World i of a batch has the gradient, and the slopes, of that world alone."""
+    speeds = torch.tensor(0.05 * np.random.default_rng(1).standard_normal((3, *REST.shape)))
+    shape, along = torch.tensor(REST), torch.tensor(CHANGE)[None]
+
+    def found(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        sim = beam_beside("cable", False, REST, num_worlds=len(some), **options)
+        rollout = Rollout(sim, rest=True)
+        leaf = shape.expand(len(some), *shape.shape).clone().requires_grad_()
+        state = {"node_x": START.expand(len(some), *shape.shape), "node_v": some}
+        states = rollout(state, parameters={"rest_x": leaf}, steps=2)
+        by_rest = torch.autograd.grad((states.node_x * WEIGHT).sum(), leaf)[0]
+        _, slopes = jvp(rollout, {"parameters": {"rest_x": along}}, state, parameters={"rest_x": shape}, steps=2)
+        return by_rest, slopes.node_x[0, -1]
+
+    batch = found(speeds)
+    for world in range(3):
+        for several, single in zip(batch, found(speeds[world : world + 1]), strict=True):
+            assert torch.equal(several[world], single[0])
 
 
 def test_refusals() -> None:

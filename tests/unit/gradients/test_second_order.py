@@ -103,12 +103,13 @@ def test_a_blow(thirds: list[bool]) -> None:
     assert thirds
 
 
+@pytest.mark.parametrize("options", [{}, {"law": "nh_log", "pressure_tangent": True}], ids=["plain", "tangent"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_smooth_and_rough_worlds_change_no_bit_of_each_other(precision: str) -> None:
+def test_smooth_and_rough_worlds_change_no_bit_of_each_other(precision: str, options: dict[str, Any]) -> None:
     """Worlds of a batch have the gradients of each alone; float32 has other paths for one world and for many."""
 
     def found(seeds: list[int]) -> Inputs:
-        sim = cube(num_worlds=len(seeds), precision=precision, integrator="bdf2", locked=False)
+        sim = cube(num_worlds=len(seeds), precision=precision, integrator="bdf2", locked=False, **options)
         return gradients(Rollout(sim), blown(sim, seeds), weights(sim))
 
     others = [[1], [2], [3]] if precision == "float64" else [[1, 1, 1], [2, 2, 2], [3, 3, 3]]
