@@ -88,8 +88,10 @@ class Rollout:
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         rest = checks.flag(rest, "gradients.Rollout: rest")
         require_differentiable(sim)
-        if rest and sim.model.has_moving_frames:
-            told = "rest shapes have no gradient beside rods, and rigid bodies that move or carry something"
+        if rest and sim.model.joints is not None:
+            raise ValueError("gradients.Rollout: rest shapes have no gradient beside joints yet; leave rest=True out")
+        if rest and _carries_nodes(sim.model):
+            told = "rest shapes have no gradient where rods or rigid bodies carry nodes yet"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
         if rest and sim.model.reduction is not None:
             raise ValueError(
@@ -231,6 +233,12 @@ class Rollout:
         parts |= {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
         marked = self._markers(x, frames["frame_pose"] if model.has_moving_frames else None)
         return States(step, x, v, tension, pressure, marked, **parts)
+
+
+def _carries_nodes(model: Model) -> bool:
+    """Whether frames carry nodes of soft bodies or cables."""
+    frames = model.frames
+    return frames is not None and bool((frames.carried_slot.numpy() < model.node_count).any())
 
 
 class _Steps(torch.autograd.Function):

@@ -14,6 +14,7 @@ from softwarp import meshing
 from softwarp.gradients import Equilibrium, Rollout, States, jvp
 from tests.cases import material
 from tests.gradient_cases import cube
+from tests.unit.gradients import test_every_input
 from tests.unit.gradients.test_equilibrium import beam
 
 MESH = meshing.box((0.1, 0.04, 0.04), (3, 1, 1))
@@ -105,12 +106,15 @@ def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.
         pytest.param("nothing", "trapezoidal", {}, id="trapezoidal"),
         pytest.param("nothing", "trapezoidal", NEWTON, id="trapezoidal, solved", marks=pytest.mark.slow),
         pytest.param("ball", "bdf2", {"contact_passes": 0}, id="contact"),
+        pytest.param("free ball", "euler", {}, id="a free ball, euler"),
+        pytest.param("free ball", "bdf2", {"contact_passes": 1}, id="a free ball"),
+        pytest.param("free ball", "euler", NEWTON, id="a free ball, solved", marks=pytest.mark.slow),
         pytest.param("ball", "bdf2", {"contact_passes": 1}, id="a look"),
         pytest.param("ball", "bdf2", NEWTON, id="contact, solved", marks=pytest.mark.slow),
     ],
 )
-def test_steps_of_second_order(beside: str, integrator: str, options: dict[str, Any]) -> None:
-    """Every stage adds its own; beside contact they are rough ones."""
+def test_beside_other_parts(beside: str, integrator: str, options: dict[str, Any]) -> None:
+    """In steps of second order every stage adds its own; beside contact they are rough ones."""
 
     def found(rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tensor:
         return stepped(beam_beside(beside, False, rest, integrator=integrator, **options), START, leaf)
@@ -125,7 +129,13 @@ def test_steps_of_second_order(beside: str, integrator: str, options: dict[str, 
 
 @pytest.mark.parametrize(
     ("beside", "options"),
-    [("cable", {}), ("ball", {}), ("cable", {"integrator": "bdf2"}), pytest.param("cable", NEWTON, marks=[SLOW])],
+    [
+        ("cable", {}),
+        ("ball", {}),
+        ("free ball", {}),
+        ("cable", {"integrator": "bdf2"}),
+        pytest.param("cable", NEWTON, marks=[SLOW]),
+    ],
 )
 def test_both_modes_agree(beside: str, options: dict[str, Any]) -> None:
     """To rounding, by two directions at once, one of them of moduli and velocities too, and by dual tensors."""
@@ -184,9 +194,14 @@ def beam_beside(beside: str, newton: bool, rest: np.ndarray, num_worlds: int = 1
     builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
     if beside != "nothing":
         builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
-    if beside == "ball":
-        ball = builder.add_rigid(sw.Sphere(0.02), kinematic=True, pose=(0.09, 0.02, -0.0195))
+    if beside in ("ball", "free ball"):
+        how: dict[str, Any] = {"kinematic": True} if beside == "ball" else {"mass": 0.03, "damping": 0.2}
+        ball = builder.add_rigid(sw.Sphere(0.02), pose=(0.09, 0.02, -0.0195), **how)
         builder.add_contact(body, ball, mu=0.4)
+    if beside == "free ball":
+        rod = builder.add_rod([[0.2, 0.0, 0.0], [0.25, 0.0, 0.0]], radius=0.01, youngs=1e6, density=1e3)
+        link = builder.add_rigid(sw.Box((0.02, 0.02, 0.02)), mass=0.02, pose=(0.26, 0.0, 0.0))
+        builder.attach(link, to=rod, node=1)
     found = {"gauss_seidel_iterations": 3000, "gauss_seidel_tolerance": 1e-14}
     options = {**found, **(NEWTON if newton else {}), **more}
     sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), dt=0.01, **options)
@@ -226,5 +241,9 @@ def test_refusals() -> None:
         Equilibrium(sim)(parameters={"rest_x": shape})
     with pytest.raises(ValueError, match="membrane 'membrane0' has no gradient by the rest shape yet"):
         Rollout(cube(covered=True), rest=True)
+    with pytest.raises(ValueError, match="no gradient where rods or rigid bodies carry nodes yet; leave rest=True out"):
+        Rollout(test_every_input.carried(), rest=True)
+    with pytest.raises(ValueError, match="rest shapes have no gradient beside joints yet"):
+        Rollout(test_every_input.jointed(), rest=True)
     with pytest.raises(ValueError, match="equilibria with membrane 'membrane0' have no gradient yet"):
         Equilibrium(cube(covered=True))
