@@ -90,7 +90,9 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
         parts: dict[str, dict[str, torch.Tensor]] = {"state": {}, "params": {}, "control": {}, "moving": {}}
         for name, slope in direction.items():
             group, _, own = name.partition(".")
-            if group == "control" and slope.ndim > worlds.control[own].ndim:
+            if own == "rest_x" and plan.rest is not None:
+                parts["params"] |= plan.rest.slopes(slope)
+            elif group == "control" and slope.ndim > worlds.control[own].ndim:
                 parts["moving"][f"command_{own}"] = slope
             else:
                 parts[group][f"command_{own}" if group == "control" else own] = slope
@@ -111,6 +113,8 @@ def push(call: Call, directions: Sequence[Tensors]) -> tuple[list[torch.Tensor],
                 for slope, each in zip(along, now, strict=True):
                     slope[place].copy_(each[name])
     check_steps(call)
+    if any("params.rest_x" in direction for direction in directions):
+        check_guard(worlds.pressed, worlds.model)
     check_adrift(worlds)
     check_unsure(worlds)
     return kept, slopes

@@ -9,7 +9,6 @@ import torch
 from softwarp import checks
 from softwarp.advice import nearest
 from softwarp.gradients.calls import Call, push
-from softwarp.gradients.refusals import require_directions
 from softwarp.gradients.rollout import GROUPS, Rollout, States, tensors_of
 
 Tensors = Mapping[str, torch.Tensor]
@@ -46,12 +45,11 @@ def jvp(
         States, and their slopes with a leading axis of directions: (direction, state, world, ...).
 
     Raises:
-        ValueError: As ``rollout``; for numbers of directions that do not agree, and for what has no forward mode.
+        ValueError: As ``rollout``, and for numbers of directions that do not agree.
         Diverged: If a step failed; the message names the worlds.
     """
     plan, given = rollout.plan(state, controls, parameters, steps=steps, every=every)
     directions = _directions(rollout, plan.steps, along)
-    require_directions(rollout.worlds.sim, {name for direction in directions for name in direction})
     with torch.no_grad():
         call = Call(rollout.worlds, plan, {name: value.detach() for name, value in given.items()})
         kept, slopes = push(call, directions)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -21,10 +21,10 @@ def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _reduced(sim), _contacts(sim))
     is_linear = sim.options.newton_iterations == 1
-    if sim.options.pressure_tangent and is_linear and sim.model.has_moving_frames:
-        told = "the tangent of pressures has no gradient beside rods, and rigid bodies that move or carry something"
+    if sim.options.pressure_tangent and is_linear and sim.model.joints is not None:
+        told = "the tangent of pressures has no gradient beside joints yet"
         return f"{told}; take pressure_tangent=False"
-    return next(itertools.chain(parts, _second_order(sim) if sim.options.integrator != "euler" else ()), None)
+    return next(parts, None)
 
 
 def require_differentiable(sim: Simulation) -> None:
@@ -35,16 +35,6 @@ def require_differentiable(sim: Simulation) -> None:
     """
     if found := missing(sim):
         raise ValueError(f"gradients.Rollout: {found}; or fit without gradients, by softwarp.identification")
-
-
-def require_directions(sim: Simulation, names: Iterable[str]) -> None:
-    """Check that slopes of tensors, named ``params.youngs`` and so on, can be pushed through steps.
-
-    Raises:
-        ValueError: Naming what cannot, and the way out.
-    """
-    if "params.rest_x" in names:
-        raise ValueError("gradients.jvp: rest shapes have no forward mode yet; take backward()")
 
 
 def require_static_gradient(sim: Simulation) -> None:
@@ -85,21 +75,9 @@ def _resting_frames(sim: Simulation) -> Iterator[str]:
 
 def _options(sim: Simulation) -> Iterator[str]:
     options = sim.options
-    frames = sim.model.frames
-    if options.integrator == "trapezoidal" and sim.model.row_count == 0 and sim.model.contact is None and frames:
-        if frames.carried_count:
-            told = "rods and rigid bodies that carry something have no gradient with integrator 'trapezoidal' yet"
-            yield f"{told}; take integrator='bdf2' or 'euler'"
     if options.repeat_swing < float("inf"):
         told = f"steps that may be taken again (repeat_swing={options.repeat_swing:g})"
         yield f"{told} have no gradient yet; take repeat_swing=inf"
-
-
-def _second_order(sim: Simulation) -> Iterator[str]:
-    """What steps of ``bdf2`` have no gradient with."""
-    told = "has no gradient with integrator 'bdf2' yet; take integrator='euler'"
-    if sim.options.pressure_tangent and sim.options.newton_iterations == 1:
-        yield f"the tangent of pressures {told}, or pressure_tangent=False"
 
 
 SHAPES = (Target.PLANE, Target.SPHERE, Target.CAPSULE, Target.BOX, Target.CYLINDER, Target.MESH)

@@ -72,6 +72,11 @@ class RestShape:
                 "gradients are taken there: build the scene from the new positions"
             )
 
+    def slopes(self, along: torch.Tensor) -> dict[str, torch.Tensor]:
+        """What follows a slope of rest positions, (world, node, 3), by names of ``Gradients``."""
+        products = self._lengths * along[:, None]  # sums one after the other: the same bits in every batch
+        return {"rest_x": along, "cable_rest_length": products.flatten(2).cumsum(dim=-1)[..., -1]}
+
     def gradient(self, by_x: torch.Tensor, by_length: torch.Tensor) -> torch.Tensor:
         """By rest positions, (world, node, 3), from that by elements and that by the lengths of cables."""
         return by_x + torch.einsum("wc,cni->wni", by_length, self._lengths)

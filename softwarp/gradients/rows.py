@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from softwarp.model.floating import RIGID, FloatingModel
-from softwarp.model.gradients import FRAMES, PARAMETERS
+from softwarp.model.gradients import FRAMES, PARAMETERS, REST
 from softwarp.model.model import Model
 from softwarp.model.reduction import ReductionModel
 from softwarp.simulation import Simulation
@@ -186,7 +186,7 @@ class RowDirections:
         if room is not None:
             worlds.keep_solution(room, 0)
         worlds.place(start)
-        parameters = any(name in PARAMETERS for name in held)
+        parameters = any(name in (*PARAMETERS, *REST) for name in held)
         found = {
             name: worlds.gradients[name].new_zeros((len(slopes), *worlds.gradients[name].shape))
             for name in worlds.names

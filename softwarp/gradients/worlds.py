@@ -190,7 +190,7 @@ class DifferentiableWorlds:
         import torch
 
         model = sim.model
-        self.sim, self.model, self.h = sim, model, sim.dt
+        self.sim, self.model, self.h, self._has_rest = sim, model, sim.dt, rest
         room = OwnArrays(model)
         self.state, self.control, self.parameters, self.gradients = room.views
         self.arrays = room.names
@@ -288,6 +288,7 @@ class DifferentiableWorlds:
             or self.model.reduction is not None
             or (self.model.contact is not None and self.model.contact.topology.has_embedded)
             or not self.solution_bytes
+            or self._has_rest
         ):
             self._directions = RowDirections(self)
         elif self._directions is None:
@@ -388,7 +389,7 @@ def _adjoint(
     """What pulls gradients through the steps that ``steps`` takes."""
     if isinstance(steps, SecondOrder):
         of_stages = SecondOrderAdjoint if steps.stages is BDF2 else TrapezoidalAdjoint
-        return of_stages(steps, gradients, index)
+        return of_stages(steps, gradients, index, rest=rest)
     if steps.control is not None:
         return NewtonAdjoint(steps, gradients, index, rest=rest)
     if steps.system.model.joints is not None:

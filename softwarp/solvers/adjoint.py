@@ -410,6 +410,8 @@ class StepAdjoint:
             self.leaning.push(self.seed, self.q)
             if self.contact is not None and self.leaning.multiply is None:
                 self.contact.add_forces(self.leaning.pushed)
+            if self.surface is not None:
+                self.surface.take(self.p, self.leaning.pushed)
         if self.frames is not None:
             self.frames.lift(self.element_v, self.node_p)
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
@@ -440,7 +442,8 @@ class StepAdjoint:
         inputs = [m.point_count, m.first_row("cavity"), c.ring_start, c.point_ring, c.point_cavity, c.cavity_area]
         s.each_real(self.k_chambers.cavity_points, int(c.starts[-1]), [*inputs, *fields], [self.point.real])
         if self.surface is not None:
-            self.surface.pull(self.p, self.point, g.cavity_pressure)
+            start_v = self.surface.rest_v if self.leaning is None else self.leaning.start_v
+            self.surface.pull(self.p, start_v, self.point, g.cavity_pressure)
 
     def _nodal(self) -> list[wp.array]:
         """v and p of nodes."""

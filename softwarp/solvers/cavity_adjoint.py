@@ -22,6 +22,9 @@ class SurfaceAdjoint:
         shard: Worlds.
         model: Chambers.
         h: Step [s].
+
+    Attributes:
+        rest_v: Velocities that a step is linearised with at its start, 0.
     """
 
     def __init__(self, shard: Shard, model: CavityModel, h: float) -> None:
@@ -43,6 +46,7 @@ class SurfaceAdjoint:
         self.point_edge = wp.array(order // 2, dtype=wp.int32, device=device)
         self.point_side = wp.array(1.0 - 2.0 * (order % 2), dtype=real, device=device)
         self.bar = shard.rows(3 * edges)
+        self.rest_v, self.held_x = shard.rows(shard.dof_room), shard.rows(shard.work.point_x.real.shape[1])  # 0
         self.k_sums = directional_sums.kernels(shard.variant)
         rows, columns = shard.model.block_row.numpy(), shard.model.block_col.numpy()
         of_block, weight = block, model.coupling_weight.numpy()
@@ -55,17 +59,18 @@ class SurfaceAdjoint:
         self.pressed_dof = wp.array(others[order], dtype=wp.int32, device=device)
         self.pressed_weight = wp.array(signed[order], dtype=real, device=device)
 
-    def pull(self, p: Rows, point: Rows, by_pressure: wp.array) -> None:
+    def pull(self, p: Rows, start_v: Rows, point: Rows, by_pressure: wp.array) -> None:
         """Add gradients.
 
         Args:
             p: Adjoint of the velocities of dofs.
+            start_v: Velocities of dofs that the step is linearised with.
             point: Gradients by points.
             by_pressure: Those by pressures at the start of the step, (world, chamber).
         """
         s, m, w, k = self.shard, self.model, self.shard.work, self.k
         inputs = [self.edge_start, self.edge_block, self.edge_weight, s.model.block_row, s.model.block_col]
-        s.each_real(k.tangent_edges, self.edges, [*inputs, w.dof_v.real, p.real], [self.bar.real])
+        s.each_real(k.tangent_edges, self.edges, [*inputs, w.dof_v.real, start_v.real, p.real], [self.bar.real])
         inputs = [self.square, s.model.point_count, self.point_edge_start, self.point_edge, self.point_side]
         inputs += [m.point_cavity, self.bar.real, s.input["pressure"].real]
         s.each_real(k.tangent_points, int(m.starts[-1]), inputs, [point.real])
@@ -80,10 +85,17 @@ class SurfaceAdjoint:
             pressure: Slopes of pressures at the start of the step.
             side: The right-hand side.
         """
+        self._press(point_x, pressure, self.shard.work.dof_v, side)
+
+    def take(self, p: Rows, pushed: Rows) -> None:
+        """Take the tangent times ``p`` from A p."""
+        self._press(self.held_x, self.shard.input["pressure"], p, pushed)
+
+    def _press(self, point_x: Rows, pressure: Rows, v: Rows, side: Rows) -> None:
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [self.square, self.dof_start, self.pressed_edge, self.pressed_dof, self.pressed_weight]
         inputs += [m.edge_cavity, m.edge_opposite, s.model.dof_free, w.point_x.real, point_x.real]
-        inputs += [s.input["pressure"].real, pressure.real, w.dof_v.real]
+        inputs += [s.input["pressure"].real, pressure.real, v.real]
         s.each_real(self.k_sums.pressed_dofs, s.model.dof_count, inputs, [side.real])
 
 

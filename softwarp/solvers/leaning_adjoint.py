@@ -147,7 +147,7 @@ class Leaning:
     Attributes:
         element_v, row_v: What elements and rows have in the place of the velocities of nodes.
         start_v, lean: Velocities of dofs at the start of a stage, else 0; and e y.
-        pushed: The seed less h H' q, and less what contacts have likewise.
+        pushed: The seed less h H' q, and less what contacts have likewise: A p, but for the tangent of pressures.
     """
 
     def __init__(

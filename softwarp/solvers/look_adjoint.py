@@ -203,8 +203,10 @@ class LookStageAdjoint(Looking, StageAdjoint):
         gradients: Gradients,
         index: AdjointIndex,
         heed: Callable[[Rows], None] | None = None,
+        *,
+        rest: bool = False,
     ) -> None:
-        super().__init__(step.system, step.h, step.pace, step.predict, gradients, index, step.judge, heed)
+        super().__init__(step.system, step.h, step.pace, step.predict, gradients, index, step.judge, heed, rest=rest)
         self._look_at(FirstSolution(step.system, step.h, self.start_v))
 
     def solve_again(self) -> None:

@@ -136,6 +136,7 @@ class SecondOrder:
         self.is_free = system.contact is None and model.row_count == 0
         self.stages = TRAPEZOIDAL if system.options.integrator == "trapezoidal" and self.is_free else BDF2
         self.base = self.start  # of extrapolations
+        self.told = self._told()
         if self._keeps_twice:
             self.base = {name: self._like(array) for name, array in self.moving.items()}
         self.smooth = {name: self._like(array) for name, array in self.arrays.items()}
@@ -145,6 +146,14 @@ class SecondOrder:
         self.rough, self.failed, self.worst = (self._codes() for _ in range(3))
         self.steps = [self._euler(stage, first=number == 0) for number, stage in enumerate(self.stages)]
         self.third = self._euler(THIRD, first=False)
+
+    def _told(self) -> wp.array:
+        """Frames whose twists are told them where a step ends in an extrapolation, as 1."""
+        frames = self.system.model.frames
+        told = np.zeros(0 if frames is None else frames.count, dtype=np.int32)
+        if frames is not None and self.stages is TRAPEZOIDAL:
+            told[: frames.rigid_count] = frames.is_kinematic
+        return wp.array(told, dtype=wp.int32, device=self.shard.device)
 
     @property
     def _keeps_twice(self) -> bool:
@@ -284,7 +293,7 @@ class SecondOrder:
                 s.each_real(self.k.extrapolate, s.variant.parts(now[name].shape[1]), inputs, [now[name]])
         if m.frames is not None:
             start, end = ([arrays["frame_pose"], arrays["frame_twist"]] for arrays in (base, now))
-            inputs = [factor, s.lanes, m.frames.frame_spin, *start, self.rough]
+            inputs = [factor, s.lanes, m.frames.frame_spin, self.told, *start, self.rough]
             s.each_real(self.k.extrapolate_frames, s.variant.parts(m.frames.count), inputs, end)
             lapse = (factor - 1.0) * stage.length * self.h
             inputs = [factor, lapse, s.lanes, m.frames.frame_spin, *start, self.rough, self.system.work.compound.real]

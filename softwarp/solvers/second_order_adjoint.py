@@ -35,14 +35,15 @@ class SecondOrderAdjoint:
         stepper: Takes the step; its system has the state that the step started from.
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
 
     Attributes:
         solution: Nothing is kept of a step.
         pulls: Adjoints of the stages; the last one is that of rough worlds.
     """
 
-    def __init__(self, stepper: SecondOrder, gradients: Gradients, index: AdjointIndex) -> None:
-        self.stepper, self.gradients = stepper, gradients
+    def __init__(self, stepper: SecondOrder, gradients: Gradients, index: AdjointIndex, *, rest: bool = False) -> None:
+        self.stepper, self.gradients, self.rest = stepper, gradients, rest
         self.solution: list[wp.array] = []
         system, device = stepper.system, stepper.shard.device
         self.k = stage_adjoint.kernels(system.variant)
@@ -70,14 +71,13 @@ class SecondOrderAdjoint:
 
     def _stage(self, step: ImplicitEuler | PredictedEuler, index: AdjointIndex) -> StepAdjoint:
         if isinstance(step, PredictedEuler) and step.system.multipliers.corrections:
-            return LookStageAdjoint(step, self.gradients, index, self._heed)
+            return LookStageAdjoint(step, self.gradients, index, self._heed, rest=self.rest)
         if isinstance(step, PredictedEuler):
-            return StageAdjoint(
-                step.system, step.h, step.pace, step.predict, self.gradients, index, step.judge, self._heed
-            )
+            what = (step.system, step.h, step.pace, step.predict, self.gradients, index, step.judge, self._heed)
+            return StageAdjoint(*what, rest=self.rest)
         if step.control is None:  # beside joints, at the start
             return JointStepAdjoint(step.system, step.h, self.gradients, index, step.pace)
-        return NewtonAdjoint(step, self.gradients, index)
+        return NewtonAdjoint(step, self.gradients, index, rest=self.rest)
 
     def _heed(self, target: Rows) -> None:
         """1 in smooth worlds, else 0."""
@@ -154,7 +154,8 @@ class SecondOrderAdjoint:
         rests = [self.rests[name] for name in FRAMES]
         for rest in rests:
             rest.zero_()
-        inputs = [stage.factor, s.lanes, frames.frame_master, frames.frame_spin, starts[0], ends[0], stepper.rough]
+        inputs = [stage.factor, s.lanes, frames.frame_master, frames.frame_spin, stepper.told]
+        inputs += [starts[0], ends[0], stepper.rough]
         s.each_real(self.k_frames.part_frames, frames.count, inputs, [*bars, *rests])
         if of_stage is not None:
             of_stage.more_share.zero()

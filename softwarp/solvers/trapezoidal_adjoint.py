@@ -43,14 +43,15 @@ class LaterAdjoint(StageAdjoint):
         step: Takes the stage; its system has the state that it starts from.
         gradients: Arrays of these worlds, read and written.
         index: Of the model.
+        rest: Whether gradients by the rest shape are asked for.
     """
 
     follows = 0.0
 
-    def __init__(self, step: PredictedEuler, gradients: Gradients, index: AdjointIndex) -> None:
-        super().__init__(step.system, step.h, step.pace, self._recall, gradients, index)
+    def __init__(self, step: PredictedEuler, gradients: Gradients, index: AdjointIndex, *, rest: bool) -> None:
+        super().__init__(step.system, step.h, step.pace, self._recall, gradients, index, rest=rest)
         self.found_v = self.shard.rows(self.shard.dof_room)
-        self.earlier = EarlierAdjoint(step.system, step.h, step.pace, step.predict, gradients, index)
+        self.earlier = EarlierAdjoint(step.system, step.h, step.pace, step.predict, gradients, index, rest=rest)
         self.earlier.later = self
         names = [*STATE, *FRAMES, *MEMORIES]
         names += [field.name for field in fields(gradients) if field.name.startswith("command_")]
@@ -82,13 +83,10 @@ class LaterAdjoint(StageAdjoint):
 
 
 class TrapezoidalAdjoint(SecondOrderAdjoint):
-    """Pulls gradients by the end of a step of the trapezoidal rule back to its start; see ``SecondOrderAdjoint``.
+    """Pulls gradients by the end of a step of the trapezoidal rule back to its start; see ``SecondOrderAdjoint``."""
 
-    Nothing is carried, whose end would be found anew from what is extrapolated.
-    """
-
-    def __init__(self, stepper: SecondOrder, gradients: Gradients, index: AdjointIndex) -> None:
-        super().__init__(stepper, gradients, index)
+    def __init__(self, stepper: SecondOrder, gradients: Gradients, index: AdjointIndex, *, rest: bool = False) -> None:
+        super().__init__(stepper, gradients, index, rest=rest)
         device = stepper.shard.device
         self.starts, self.stops = (
             [
@@ -105,7 +103,7 @@ class TrapezoidalAdjoint(SecondOrderAdjoint):
 
     def _stage(self, step: ImplicitEuler | PredictedEuler, index: AdjointIndex) -> StepAdjoint:
         if isinstance(step, PredictedEuler):
-            return LaterAdjoint(step, self.gradients, index)
+            return LaterAdjoint(step, self.gradients, index, rest=self.rest)
         return super()._stage(step, index)
 
     def _step(self, *, parameters: bool) -> None:
@@ -119,6 +117,7 @@ class TrapezoidalAdjoint(SecondOrderAdjoint):
             stepper.solve(number)
             self._copy(ALL, {name: stepper.arrays[name] for name in stop}, stop)
             stepper.extrapolate(number)
+        self._take_carried()
         for number in reversed(range(len(stepper.stages))):
             stage = stepper.stages[number]
             self._copy(ALL, self.starts[number], stepper.arrays)
@@ -130,3 +129,15 @@ class TrapezoidalAdjoint(SecondOrderAdjoint):
             self._add(self.rests, self.moved)
         for name, total in self.sums.items():
             wp.copy(self.commands[name], total)
+
+    def _take_carried(self) -> None:
+        """What is by carried nodes and frames at the end of the step, where they follow from what carries them."""
+        model, of_stage, arrays = self.frames, self.pulls[0].frames, self.stepper.arrays
+        if model is None or of_stage is None or not model.carried_count:
+            return
+        s, g = self.stepper.shard, self.gradients
+        inputs = [s.model.node_count, model.frame_master, model.frame_offset, of_stage.item_start, of_stage.item]
+        inputs += [model.carried_slot, model.carried_offset, *(arrays[name] for name in FRAMES)]
+        bars = [g.node_x, g.node_v, *(getattr(g, name) for name in FRAMES)]
+        worlds = g.frame_pose.shape[0]
+        wp.launch(self.k_frames.take_carried, dim=(worlds, model.count), inputs=inputs, outputs=bars, device=s.device)

@@ -298,13 +298,15 @@ def test_rates():
     assert float(sim.cavity_pressure) == pytest.approx(1.0e3, rel=1e-9)
 
 
-def test_velocity_commands():
-    """A kinematic body moves with its commanded velocity, whatever the stages are."""
-    sim = driven(0.01, "bdf2")
+@pytest.mark.parametrize("integrator", ["bdf2", "trapezoidal"])
+def test_velocity_commands(integrator):
+    """A kinematic body moves with its commanded velocity, whatever the stages are, and has it at the end of a step."""
+    sim = driven(0.01, integrator)
     sim.control.body_velocity[0, 0, :] = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     sim.step(10)
     assert float(sim.frame_pose[0, 0, 0]) == pytest.approx(0.01, rel=1e-9)
     assert 2.0 * float(torch.atan2(sim.frame_pose[0, 0, 5], sim.frame_pose[0, 0, 6])) == pytest.approx(0.1, rel=1e-9)
+    torch.testing.assert_close(sim.body_twist, sim.control.body_velocity, rtol=1e-12, atol=1e-13)
 
 
 def test_trapezoidal_is_bdf2_with_rows():

@@ -26,7 +26,7 @@ from softwarp.model.codes import Spin
 
 @single_worlds
 def functions(variant: Variant) -> SimpleNamespace:
-    """Gradients by turns, for one scalar type."""
+    """Gradients by turns and by what frames carry, for one scalar type."""
     real = variant.real
     one = single.functions(variant)
     vec3, mat33, quat = one.vec3, one.mat33, one.quat
@@ -55,79 +55,10 @@ def functions(variant: Variant) -> SimpleNamespace:
         c = wp.cross(v, x)
         return x - first * c + second * wp.cross(v, c)
 
-    return SimpleNamespace(turn_bar=turn_bar, by_turn=by_turn, jacobian_transposed=jacobian_transposed)
-
-
-@single_worlds
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Kernels for one scalar type, on single worlds."""
-    real = variant.real
-    module = variant.module("adjoint.frames")
-    one = single.functions(variant)
-    vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
-    inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
-    compounds = of_compounds(variant)
-    turned, momentum = compounds.turned, compounds.momentum
-    turns = functions(variant)
-    turn_bar, by_turn, jacobian_transposed = turns.turn_bar, turns.by_turn, turns.jacobian_transposed
-    slowed = slowing(variant).slowed
-    of_end = of_momentum.functions(variant)
-    change_of_twist, inertia_inverse = of_end.change_of_twist, of_end.inertia_inverse
-    tops = top_adjoint.functions(variant)
-    top_moved, top_about_centre, top_pull = tops.moved, tops.about_centre, tops.pull
-
     @wp.func
     def of_world(array: wp.array2d(dtype=real), world: int, row: int):
         """Vector in three rows of a state array."""
         return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
-
-    @wp.func
-    def velocities(m: real, s: vec3, J: mat33, P: vec3, L: vec3):
-        """M^-1 (P, L)."""
-        about = J - (wp.dot(s, s) * wp.identity(n=3, dtype=real) - wp.outer(s, s)) / m
-        scale = real(1.0) / wp.trace(about)
-        w = scale * (wp.inverse(scale * about) * (L - wp.cross(s, P) / m))
-        return (P - wp.cross(w, s)) / m, w
-
-    @wp.func
-    def moved_on(
-        m: real, s: vec3, J: mat33, q: quat, own: mat33, P: vec3, L: vec3, V: vec3, w: vec3, free_t: vec3, free_r: vec3
-    ):
-        """(V, w) with the momentum P, L along free axes, and as it was along held ones."""
-        V1 = V
-        w1 = w
-        if wp.min(wp.min(free_t), wp.min(free_r)) > real(0.0):
-            V1, w1 = velocities(m, s, J, P, L)
-        else:
-            had_p, had_l = momentum(m, s, J, V, w)
-            dV, dw = change_of_twist(P - had_p, L - had_l, m, s, q, own, free_t, free_r)
-            V1 += dV
-            w1 += dw
-        return V1, w1
-
-    @wp.func
-    def of_momentum_bars(
-        m: real, s: vec3, J: mat33, q: quat, own: mat33, by_v: vec3, by_w: vec3, free_t: vec3, free_r: vec3
-    ):
-        """Gradients by the momentum in ``moved_on``, and by (V, w) themselves."""
-        c_t = vec3()
-        c_r = vec3()
-        rest_v = vec3()
-        rest_w = vec3()
-        if wp.min(wp.min(free_t), wp.min(free_r)) > real(0.0):
-            c_t, c_r = velocities(m, s, J, by_v, by_w)
-        else:
-            c_t, c_r = change_of_twist(by_v, by_w, m, s, q, own, free_t, free_r)
-            had_p, had_l = momentum(m, s, J, c_t, c_r)
-            rest_v = by_v - had_p
-            rest_w = by_w - had_l
-        return c_t, c_r, rest_v, rest_w
-
-    @wp.func
-    def put_both(out: wp.array3d(dtype=real), pack: int, lane: int, t: int, r: int, linear: vec3, angular: vec3):
-        """Write what both dofs of a frame have."""
-        put(out, pack, lane, 3 * t, linear)
-        put(out, pack, lane, 3 * r, angular)
 
     @wp.func
     def offset_of(carried_offset: wp.array2d(dtype=real), item: int):
@@ -183,6 +114,83 @@ def kernels(variant: Variant) -> SimpleNamespace:
             by_v += v
             by_w += wp.cross(r, v)
         return by_x, by_t, by_v, by_w
+
+    return SimpleNamespace(
+        turn_bar=turn_bar,
+        by_turn=by_turn,
+        jacobian_transposed=jacobian_transposed,
+        of_world=of_world,
+        offset_of=offset_of,
+        carried_bars=carried_bars,
+    )
+
+
+@single_worlds
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type, on single worlds."""
+    real = variant.real
+    module = variant.module("adjoint.frames")
+    one = single.functions(variant)
+    vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
+    inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
+    compounds = of_compounds(variant)
+    turned, momentum = compounds.turned, compounds.momentum
+    turns = functions(variant)
+    turn_bar, by_turn, jacobian_transposed = turns.turn_bar, turns.by_turn, turns.jacobian_transposed
+    of_world, offset_of, carried_bars = turns.of_world, turns.offset_of, turns.carried_bars
+    slowed = slowing(variant).slowed
+    of_end = of_momentum.functions(variant)
+    change_of_twist, inertia_inverse = of_end.change_of_twist, of_end.inertia_inverse
+    tops = top_adjoint.functions(variant)
+    top_moved, top_about_centre, top_pull = tops.moved, tops.about_centre, tops.pull
+
+    @wp.func
+    def velocities(m: real, s: vec3, J: mat33, P: vec3, L: vec3):
+        """M^-1 (P, L)."""
+        about = J - (wp.dot(s, s) * wp.identity(n=3, dtype=real) - wp.outer(s, s)) / m
+        scale = real(1.0) / wp.trace(about)
+        w = scale * (wp.inverse(scale * about) * (L - wp.cross(s, P) / m))
+        return (P - wp.cross(w, s)) / m, w
+
+    @wp.func
+    def moved_on(
+        m: real, s: vec3, J: mat33, q: quat, own: mat33, P: vec3, L: vec3, V: vec3, w: vec3, free_t: vec3, free_r: vec3
+    ):
+        """(V, w) with the momentum P, L along free axes, and as it was along held ones."""
+        V1 = V
+        w1 = w
+        if wp.min(wp.min(free_t), wp.min(free_r)) > real(0.0):
+            V1, w1 = velocities(m, s, J, P, L)
+        else:
+            had_p, had_l = momentum(m, s, J, V, w)
+            dV, dw = change_of_twist(P - had_p, L - had_l, m, s, q, own, free_t, free_r)
+            V1 += dV
+            w1 += dw
+        return V1, w1
+
+    @wp.func
+    def of_momentum_bars(
+        m: real, s: vec3, J: mat33, q: quat, own: mat33, by_v: vec3, by_w: vec3, free_t: vec3, free_r: vec3
+    ):
+        """Gradients by the momentum in ``moved_on``, and by (V, w) themselves."""
+        c_t = vec3()
+        c_r = vec3()
+        rest_v = vec3()
+        rest_w = vec3()
+        if wp.min(wp.min(free_t), wp.min(free_r)) > real(0.0):
+            c_t, c_r = velocities(m, s, J, by_v, by_w)
+        else:
+            c_t, c_r = change_of_twist(by_v, by_w, m, s, q, own, free_t, free_r)
+            had_p, had_l = momentum(m, s, J, c_t, c_r)
+            rest_v = by_v - had_p
+            rest_w = by_w - had_l
+        return c_t, c_r, rest_v, rest_w
+
+    @wp.func
+    def put_both(out: wp.array3d(dtype=real), pack: int, lane: int, t: int, r: int, linear: vec3, angular: vec3):
+        """Write what both dofs of a frame have."""
+        put(out, pack, lane, 3 * t, linear)
+        put(out, pack, lane, 3 * r, angular)
 
     @wp.kernel(module=module, enable_backward=False)
     def carried_motion(

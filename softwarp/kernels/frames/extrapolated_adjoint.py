@@ -30,6 +30,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     about_centre, drifted, pull_extrapolated = tops.about_centre, tops.drifted, tops.pull_extrapolated
     turns, of_rods = of_frames.functions(variant), rod_adjoint.functions(variant)
     turn_bar, jacobian_transposed = turns.turn_bar, turns.jacobian_transposed
+    of_world, carried_bars = turns.of_world, turns.carried_bars
     slopes, twisted = of_rods.slopes, of_rods.twisted
 
     @wp.func
@@ -51,6 +52,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Model
         frame_master: wp.array(dtype=wp.int32),
         frame_spin: wp.array(dtype=wp.int32),
+        told: wp.array(dtype=wp.int32),
         # State
         pose0_in: wp.array2d(dtype=real),
         pose1_in: wp.array2d(dtype=real),
@@ -78,6 +80,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     pose_rest_out[world, row + c] = bar - factor * bar
                 for c in range(6):
                     bar = twist_bar_out[world, 6 * frame + c]
+                    if told[frame] != 0:  # stays, and has nothing by the start
+                        continue
                     twist_bar_out[world, 6 * frame + c] = factor * bar
                     twist_rest_out[world, 6 * frame + c] = bar - factor * bar
                 q0 = quat()
@@ -95,11 +99,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 by_start -= wp.quat_rotate_inv(exponential(phi), by_end)
                 put_turn(pose_bar_out, world, row + 3, q1, by_end)
                 put_turn(pose_rest_out, world, row + 3, q0, by_start)
-
-    @wp.func
-    def of_world(array: wp.array2d(dtype=real), world: int, row: int):
-        """Vector in three rows of a state array."""
-        return vec3(array[world, row], array[world, row + 1], array[world, row + 2])
 
     @wp.func
     def put_twist(bar: wp.array2d(dtype=real), world: int, row: int, linear: vec3, angular: vec3):
@@ -190,4 +189,70 @@ def kernels(variant: Variant) -> SimpleNamespace:
             put_twist(twist_bar_out, world, t, v1, s1)
             put_twist(twist_rest_out, world, t, v0, s0)
 
-    return SimpleNamespace(part_frames=part_frames, part_tops=part_tops)
+    @wp.kernel(module=module, enable_backward=False)
+    def take_carried(
+        nodes: int,
+        # Model
+        frame_master: wp.array(dtype=wp.int32),
+        frame_offset: wp.array2d(dtype=real),
+        frame_item_start: wp.array(dtype=wp.int32),
+        frame_item: wp.array(dtype=wp.int32),
+        carried_slot: wp.array(dtype=wp.int32),
+        carried_offset: wp.array2d(dtype=real),
+        # State
+        pose_in: wp.array2d(dtype=real),
+        twist_in: wp.array2d(dtype=real),
+        # State out
+        x_bar_out: wp.array2d(dtype=real),
+        v_bar_out: wp.array2d(dtype=real),
+        pose_bar_out: wp.array2d(dtype=real),
+        twist_bar_out: wp.array2d(dtype=real),
+    ):
+        """Add what is by the nodes and frames that one frame carries to what is by its pose and twist, and leave 0.
+
+        After an extrapolation these are where the frame is, whatever the stage before has led them to.
+        """
+        world, frame = wp.tid()
+        if frame_master[frame] != frame:
+            return
+        row = 7 * frame
+        q = quat()
+        for c in range(4):
+            q[c] = pose_in[world, row + 3 + c]
+        by_x, by_t, by_v, by_w = carried_bars(
+            frame_item_start,
+            frame_item,
+            carried_slot,
+            carried_offset,
+            frame_offset,
+            nodes,
+            x_bar_out,
+            v_bar_out,
+            pose_bar_out,
+            twist_bar_out,
+            world,
+            frame,
+            q,
+            of_world(twist_in, world, 6 * frame + 3),
+        )
+        by_q = quat(by_t[0], by_t[1], by_t[2], real(0.0)) * q * real(2.0)
+        for c in range(3):
+            pose_bar_out[world, row + c] = pose_bar_out[world, row + c] + by_x[c]
+            twist_bar_out[world, 6 * frame + c] = twist_bar_out[world, 6 * frame + c] + by_v[c]
+            twist_bar_out[world, 6 * frame + 3 + c] = twist_bar_out[world, 6 * frame + 3 + c] + by_w[c]
+        for c in range(4):
+            pose_bar_out[world, row + 3 + c] = pose_bar_out[world, row + 3 + c] + by_q[c]
+        for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
+            slot = carried_slot[frame_item[i]]
+            if slot < nodes:
+                for c in range(3):
+                    x_bar_out[world, 3 * slot + c] = real(0.0)
+                    v_bar_out[world, 3 * slot + c] = real(0.0)
+            else:
+                welded = (slot - nodes) / 2
+                for c in range(7):
+                    pose_bar_out[world, 7 * welded + c] = real(0.0)
+                for c in range(6):
+                    twist_bar_out[world, 6 * welded + c] = real(0.0)
+
+    return SimpleNamespace(part_frames=part_frames, part_tops=part_tops, take_carried=take_carried)

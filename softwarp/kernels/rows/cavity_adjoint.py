@@ -243,21 +243,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         block_col: wp.array(dtype=wp.int32),
         # Workspace in
         dof_v_in: wp.array3d(dtype=real),
+        start_v_in: wp.array3d(dtype=real),
         dof_p_in: wp.array3d(dtype=real),
         # Workspace out
         edge_bar_out: wp.array3d(dtype=real),
     ):
         """Gradient by the vector s of one surface edge, with which the tangent of pressures has blocks [s]x in A.
 
-        A block (i, j) and its transpose give -p . A v the part -s . (v_j x p_i + p_j x v_i).
+        A block (i, j) and its transpose give -p . A u the part -s . (u_j x p_i + p_j x u_i), with the unknowns
+        u = v - v0 of a step that is linearised with the velocities v0.
         """
         pack, edge, lane = wp.tid()
         total = vec3()
         for k in range(edge_start[edge], edge_start[edge + 1]):
             i = 3 * block_row[edge_block[k]]
             j = 3 * block_col[edge_block[k]]
-            here = wp.cross(vector_at(dof_v_in, pack, lane, j), vector_at(dof_p_in, pack, lane, i))
-            here += wp.cross(vector_at(dof_p_in, pack, lane, j), vector_at(dof_v_in, pack, lane, i))
+            first = vector_at(dof_v_in, pack, lane, i) - vector_at(start_v_in, pack, lane, i)
+            second = vector_at(dof_v_in, pack, lane, j) - vector_at(start_v_in, pack, lane, j)
+            here = wp.cross(second, vector_at(dof_p_in, pack, lane, i))
+            here += wp.cross(vector_at(dof_p_in, pack, lane, j), first)
             total -= edge_weight[k] * here
         put(edge_bar_out, pack, lane, 3 * edge, total)
 

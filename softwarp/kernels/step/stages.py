@@ -92,6 +92,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         # Model
         frame_spin: wp.array(dtype=wp.int32),
+        told: wp.array(dtype=wp.int32),
         # State
         pose0_in: wp.array2d(dtype=real),
         twist0_in: wp.array2d(dtype=real),
@@ -103,7 +104,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """The same for frames: positions and twists in a line, orientations about the axis of the turn so far.
 
-        Free tops are left to ``kernels.frames.momentum``.
+        Free tops are left to ``kernels.frames.momentum``. Frames that are ``told`` their twists keep them.
         """
         pack, part, lane = wp.tid()
         world = pack * lanes + lane
@@ -117,9 +118,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     for c in range(3):
                         x0 = pose0_in[world, row + c]
                         pose_out[world, row + c] = x0 + factor * (pose_out[world, row + c] - x0)
-                    for c in range(6):
-                        v0 = twist0_in[world, 6 * frame + c]
-                        twist_out[world, 6 * frame + c] = v0 + factor * (twist_out[world, 6 * frame + c] - v0)
+                    if told[frame] == 0:
+                        for c in range(6):
+                            v0 = twist0_in[world, 6 * frame + c]
+                            twist_out[world, 6 * frame + c] = v0 + factor * (twist_out[world, 6 * frame + c] - v0)
                     for c in range(4):
                         q0[c] = pose0_in[world, row + 3 + c]
                         q1[c] = pose_out[world, row + 3 + c]

@@ -223,7 +223,7 @@ def test_lanes_and_kept_states_in_float32() -> None:
 
 
 def test_refusals() -> None:
-    """What is asked wrongly, and what has no forward mode, is told by name."""
+    """What is asked wrongly is told by name."""
     sim = cube()
     rollout = Rollout(sim)
     with pytest.raises(ValueError, match="along names no direction"):
@@ -234,5 +234,3 @@ def test_refusals() -> None:
         jvp(rollout, {"parameters": {"youngs": torch.ones(2, 1, 1), "nu": torch.ones(3, 1, 1)}}, steps=1)
     with pytest.raises(ValueError, match="has 2 steps, and the rollout 1"):
         jvp(rollout, {"controls": {"cable_tension": torch.ones(1, 2, 1, 2)}}, steps=1)
-    with pytest.raises(ValueError, match="rest shapes have no forward mode yet"):
-        jvp(Rollout(sim, rest=True), {"parameters": {"rest_x": torch.ones(1, *sim.model.node_rest.shape)}}, steps=1)

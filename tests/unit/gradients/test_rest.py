@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.gradients import Equilibrium, Rollout
+from softwarp.gradients import Equilibrium, Rollout, States, jvp
 from tests.cases import material
 from tests.gradient_cases import cube
+from tests.unit.gradients import test_every_input
 from tests.unit.gradients.test_equilibrium import beam
 
 MESH = meshing.box((0.1, 0.04, 0.04), (3, 1, 1))
@@ -24,6 +26,7 @@ START = torch.tensor(REST + 3e-4 * RNG.standard_normal(REST.shape))[None]
 SPEED = torch.tensor(0.05 * RNG.standard_normal(REST.shape))[None]
 WEIGHT = torch.tensor(RNG.standard_normal(REST.shape))[None]
 NEWTON: dict[str, Any] = {"newton_iterations": 60, "newton_tolerance": 1e-13}
+SLOW = pytest.mark.slow
 LAWS = ["large", "nh_log", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot", "ogden"))]
 
 
@@ -94,6 +97,82 @@ def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.
     assert abs(derivative - expected) <= 1e-6 * abs(expected)
 
 
+@pytest.mark.parametrize(
+    ("beside", "integrator", "options"),
+    [
+        pytest.param("cable", "bdf2", {}, id="bdf2"),
+        pytest.param("cable", "bdf2", NEWTON, id="bdf2, solved", marks=pytest.mark.slow),
+        pytest.param("branch", "bdf2", {}, id="memory"),
+        pytest.param("nothing", "trapezoidal", {}, id="trapezoidal"),
+        pytest.param("nothing", "trapezoidal", NEWTON, id="trapezoidal, solved", marks=pytest.mark.slow),
+        pytest.param("ball", "bdf2", {"contact_passes": 0}, id="contact"),
+        pytest.param("free ball", "euler", {}, id="a free ball, euler"),
+        pytest.param("free ball", "bdf2", {"contact_passes": 1}, id="a free ball"),
+        pytest.param("free ball", "euler", NEWTON, id="a free ball, solved", marks=pytest.mark.slow),
+        pytest.param("ball", "bdf2", {"contact_passes": 1}, id="a look"),
+        pytest.param("ball", "bdf2", NEWTON, id="contact, solved", marks=pytest.mark.slow),
+    ],
+)
+def test_beside_other_parts(beside: str, integrator: str, options: dict[str, Any]) -> None:
+    """In steps of second order every stage adds its own; beside contact they are rough ones."""
+
+    def found(rest: np.ndarray, leaf: torch.Tensor | None) -> torch.Tensor:
+        return stepped(beam_beside(beside, False, rest, integrator=integrator, **options), START, leaf)
+
+    leaf = torch.tensor(REST).requires_grad_()
+    found(REST, leaf).backward()
+    assert leaf.grad is not None
+    derivative = float((leaf.grad * torch.tensor(CHANGE)).sum())
+    ahead, back = (float(found(REST + way * CHANGE, None)) for way in (1.0, -1.0))
+    assert abs(derivative - 0.5 * (ahead - back)) <= 1e-6 * abs(derivative)
+
+
+@pytest.mark.parametrize(
+    ("beside", "options"),
+    [
+        ("cable", {}),
+        ("ball", {}),
+        ("free ball", {}),
+        ("cable", {"integrator": "bdf2"}),
+        pytest.param("cable", NEWTON, marks=[SLOW]),
+    ],
+)
+def test_both_modes_agree(beside: str, options: dict[str, Any]) -> None:
+    """To rounding, by two directions at once, one of them of moduli and velocities too, and by dual tensors."""
+    sim = beam_beside(beside, False, REST, **options)
+    rollout, shape = Rollout(sim, rest=True), torch.tensor(REST)
+    leaves = [shape.clone(), sim.params.youngs.clone(), SPEED.clone()]
+    for leaf in leaves:
+        leaf.requires_grad_()
+
+    def run(rest: torch.Tensor, youngs: torch.Tensor, v: torch.Tensor) -> States:
+        return rollout({"node_x": START, "node_v": v}, parameters={"rest_x": rest, "youngs": youngs}, steps=3)
+
+    def weighed(states: States) -> torch.Tensor:
+        return ((states.node_x + states.node_v) * WEIGHT).sum() + 0.01 * states.cable_tension.sum()
+
+    weighed(run(*leaves)).backward()
+    along = torch.stack([torch.tensor(CHANGE), 3.0 * torch.tensor(CHANGE).roll(1, 0)])
+    others = torch.tensor([0.0, 1.0]).reshape(2, 1, 1).double()
+    directions = [along, others, others[..., None] * SPEED]
+    _, slopes = jvp(
+        rollout,
+        {"parameters": dict(zip(("rest_x", "youngs"), directions, strict=False)), "state": {"node_v": directions[2]}},
+        {"node_x": START, "node_v": SPEED},
+        parameters={"rest_x": shape},
+        steps=3,
+    )
+    for number in range(2):
+        terms = [(leaf.grad * way[number]).flatten() for leaf, way in zip(leaves, directions, strict=True)]
+        backward, scale = sum(term.sum() for term in terms), sum(term.abs().sum() for term in terms)
+        one = replace(slopes, **{name: getattr(slopes, name)[number] for name in ("node_x", "node_v", "cable_tension")})
+        assert abs(float(weighed(one)) - float(backward)) <= 1e-10 * float(scale)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(shape, along[0])
+        found = run(dual, sim.params.youngs, SPEED)
+        assert torch.equal(forward_ad.unpack_dual(found.node_x).tangent, slopes.node_x[0])
+
+
 @pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("beside", ["ball", "branch"])
 def test_contacts_and_memories(beside: str, newton: bool) -> None:
@@ -106,22 +185,50 @@ def test_contacts_and_memories(beside: str, newton: bool) -> None:
     assert abs(derivative - 0.5 * (ahead - back)) <= 1e-6 * abs(derivative)
 
 
-def beam_beside(beside: str, newton: bool, rest: np.ndarray) -> sw.Simulation:
-    """The beam with one elastic cable, with a memory or on a ball."""
+def beam_beside(beside: str, newton: bool, rest: np.ndarray, num_worlds: int = 1, **more: Any) -> sw.Simulation:
+    """The beam with one elastic cable, with a memory or on a ball, or with neither; or with ``nothing`` at all."""
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     memory = (0.3, 0.05) if beside == "branch" else (0.0, 0.0)
     mesh, stuff = replace(MESH, nodes=rest), material("large", 1e5, 0.4)
     body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory)
     builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
-    builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
-    if beside == "ball":
-        ball = builder.add_rigid(sw.Sphere(0.02), kinematic=True, pose=(0.09, 0.02, -0.0195))
+    if beside != "nothing":
+        builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
+    if beside in ("ball", "free ball"):
+        how: dict[str, Any] = {"kinematic": True} if beside == "ball" else {"mass": 0.03, "damping": 0.2}
+        ball = builder.add_rigid(sw.Sphere(0.02), pose=(0.09, 0.02, -0.0195), **how)
         builder.add_contact(body, ball, mu=0.4)
+    if beside == "free ball":
+        rod = builder.add_rod([[0.2, 0.0, 0.0], [0.25, 0.0, 0.0]], radius=0.01, youngs=1e6, density=1e3)
+        link = builder.add_rigid(sw.Box((0.02, 0.02, 0.02)), mass=0.02, pose=(0.26, 0.0, 0.0))
+        builder.attach(link, to=rod, node=1)
     found = {"gauss_seidel_iterations": 3000, "gauss_seidel_tolerance": 1e-14}
-    options = {**found, **(NEWTON if newton else {})}
-    sim = sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01, **options)
+    options = {**found, **(NEWTON if newton else {}), **more}
+    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), dt=0.01, **options)
     sim.control.cable_displacement[...] = 0.004
     return sim
+
+
+@pytest.mark.parametrize("options", [{}, {"integrator": "bdf2"}], ids=["euler", "bdf2"])
+def test_worlds_beside_change_no_bit(options: dict[str, Any]) -> None:
+    """World i of a batch has the gradient, and the slopes, of that world alone."""
+    speeds = torch.tensor(0.05 * np.random.default_rng(1).standard_normal((3, *REST.shape)))
+    shape, along = torch.tensor(REST), torch.tensor(CHANGE)[None]
+
+    def found(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        sim = beam_beside("cable", False, REST, num_worlds=len(some), **options)
+        rollout = Rollout(sim, rest=True)
+        leaf = shape.expand(len(some), *shape.shape).clone().requires_grad_()
+        state = {"node_x": START.expand(len(some), *shape.shape), "node_v": some}
+        states = rollout(state, parameters={"rest_x": leaf}, steps=2)
+        by_rest = torch.autograd.grad((states.node_x * WEIGHT).sum(), leaf)[0]
+        _, slopes = jvp(rollout, {"parameters": {"rest_x": along}}, state, parameters={"rest_x": shape}, steps=2)
+        return by_rest, slopes.node_x[0, -1]
+
+    batch = found(speeds)
+    for world in range(3):
+        for several, single in zip(batch, found(speeds[world : world + 1]), strict=True):
+            assert torch.equal(several[world], single[0])
 
 
 def test_refusals() -> None:
@@ -134,5 +241,9 @@ def test_refusals() -> None:
         Equilibrium(sim)(parameters={"rest_x": shape})
     with pytest.raises(ValueError, match="membrane 'membrane0' has no gradient by the rest shape yet"):
         Rollout(cube(covered=True), rest=True)
+    with pytest.raises(ValueError, match="no gradient where rods or rigid bodies carry nodes yet; leave rest=True out"):
+        Rollout(test_every_input.carried(), rest=True)
+    with pytest.raises(ValueError, match="rest shapes have no gradient beside joints yet"):
+        Rollout(test_every_input.jointed(), rest=True)
     with pytest.raises(ValueError, match="equilibria with membrane 'membrane0' have no gradient yet"):
         Equilibrium(cube(covered=True))

@@ -1,8 +1,7 @@
-"""Gradients of steps of second order against differences: rough ones, as beside contact, and the trapezoidal rule."""
+"""Gradients of steps of second order against differences, beside contact and where they are rough."""
 
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -10,8 +9,7 @@ import softwarp as sw
 from softwarp import meshing
 from softwarp.gradients import Rollout
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
-from tests.cases import FITTED
-from tests.gradient_cases import STEPS, Inputs, cube, gradients, inputs, weights
+from tests.gradient_cases import Inputs, cube, gradients, inputs, weights
 from tests.unit.gradients import test_contact, test_every_input
 from tests.unit.gradients.test_adjoint import check
 from tests.unit.gradients.test_contact import EXACT, OPEN, SIDE, SLIPPING, STUCK
@@ -105,12 +103,13 @@ def test_a_blow(thirds: list[bool]) -> None:
     assert thirds
 
 
+@pytest.mark.parametrize("options", [{}, {"law": "nh_log", "pressure_tangent": True}], ids=["plain", "tangent"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_smooth_and_rough_worlds_change_no_bit_of_each_other(precision: str) -> None:
+def test_smooth_and_rough_worlds_change_no_bit_of_each_other(precision: str, options: dict[str, Any]) -> None:
     """Worlds of a batch have the gradients of each alone; float32 has other paths for one world and for many."""
 
     def found(seeds: list[int]) -> Inputs:
-        sim = cube(num_worlds=len(seeds), precision=precision, integrator="bdf2", locked=False)
+        sim = cube(num_worlds=len(seeds), precision=precision, integrator="bdf2", locked=False, **options)
         return gradients(Rollout(sim), blown(sim, seeds), weights(sim))
 
     others = [[1], [2], [3]] if precision == "float64" else [[1, 1, 1], [2, 2, 2], [3, 3, 3]]
@@ -151,70 +150,6 @@ def test_both_modes_agree(options: dict[str, Any]) -> None:
     """To rounding, beside contact."""
     sim = second(test_contact.block(0.5), **options)
     compare(Rollout(sim), test_contact.thrown(sim, 0.2), test_contact.loss)
-
-
-def swinging(num_worlds: int = 1, precision: str = "float64", device: str = "cpu", **options: Any) -> sw.Simulation:
-    """A soft cube with a memory and a membrane, a clamped rod, a free one and a body that tumbles, without any rows."""
-    builder = sw.ModelBuilder(gravity=(1.0, 2.0, -9.81))
-    mesh = meshing.box((0.1, 0.1, 0.1), (2, 2, 2))
-    law = FITTED["yeoh"](1e5, 0.4)
-    body = builder.add_tets(mesh, material=law, density=1e3, rayleigh=(0.5, 0.01), relaxation=(0.4, 0.02))
-    builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-6, 1.0, 1.0)))
-    builder.add_membrane(body, mesh.surface(), thickness=5e-4, youngs=4e5, nu=0.3, density=900.0)
-    builder.add_traction(body, (0.0, 0.0, 1.0), box=((-1.0, -1.0, 0.0999), (1.0, 1.0, 1.0)))
-    line = np.linspace((0.3, 0.0, 0.0), (0.5, 0.0, 0.0), 4)
-    for place in (0.0, 0.2):
-        rod = builder.add_rod(
-            line + (0.0, place, 0.0), radius=0.01, youngs=5e6, nu=0.4, density=1100.0, rayleigh=(0.2, 0.0)
-        )
-        if place == 0.0:
-            builder.fix(rod, nodes=[0])
-    builder.add_rigid(sw.Box((0.05, 0.03, 0.02)), mass=0.05, pose=(0.8, 0.0, 0.0), damping=0.3)
-    model = builder.finalize(num_worlds=num_worlds, precision=precision, device=device)
-    return sw.Simulation(model, dt=0.01, integrator="trapezoidal", **options)
-
-
-@pytest.mark.parametrize("options", [{}, pytest.param(NEWTON, marks=SLOW)])
-def test_the_trapezoidal_rule(options: dict[str, Any]) -> None:
-    """By every input; two linearisations of a stage, or stages that are solved."""
-    sim = swinging(**options)
-    given, sizes = test_every_input.given_of(sim, 0.3)
-    sizes["parameters"]["relaxation_time"] *= 100.0 if options else 10.0  # else differences are rounding
-    check_frames(Rollout(sim), given, test_every_input.loss, sizes)
-    if not options:
-        compare(Rollout(sim), given, test_every_input.loss)
-
-
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_worlds_beside_change_no_bit_of_the_trapezoidal_rule(precision: str) -> None:
-    """As of contact, above."""
-
-    def found(seeds: list[int]) -> Inputs:
-        sim = swinging(len(seeds), precision)
-        v = torch.stack([torch.tensor(np.random.default_rng(seed).standard_normal((27, 3))) for seed in seeds])
-        v = 0.05 * v.to(sim.node_x)
-        given: Inputs = {"state": {"node_v": v, "body_twist": sim.body_twist + 20.0 * v[:, :1, :1]}, "controls": {}}
-        given["parameters"] = {name: getattr(sim.params, name).clone() for name in ("youngs", "gravity")}
-        return gradients(Rollout(sim), given, test_every_input.loss, steps=STEPS)
-
-    others = [[1], [2], [3]] if precision == "float64" else [[1, 1, 1], [2, 2, 2], [3, 3, 3]]
-    batch = found([1, 2, 3])
-    for world, seeds in enumerate(others):
-        for group, held in found(seeds).items():
-            for name, value in held.items():
-                assert torch.equal(batch[group][name][world], value[0]), (seeds, group, name)
-
-
-def test_what_the_trapezoidal_rule_has_no_gradient_with_is_told() -> None:
-    """What rods carry, by name and with the way out."""
-    builder = sw.ModelBuilder()
-    line = np.linspace((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 4)
-    rod = builder.add_rod(line, radius=0.01, youngs=5e6, nu=0.4, density=1e3)
-    box = builder.add_rigid(sw.Box((0.05, 0.03, 0.02)), mass=0.05, pose=(0.2, 0.0, 0.0))
-    builder.attach(box, to=rod, node=3)
-    sim = sw.Simulation(builder.finalize(num_worlds=1), integrator="trapezoidal")
-    with pytest.raises(ValueError, match="carry something have no gradient with integrator 'trapezoidal' yet; take"):
-        Rollout(sim)
 
 
 @pytest.mark.cuda
