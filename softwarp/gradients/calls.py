@@ -166,12 +166,19 @@ def check_adrift(worlds: DifferentiableWorlds) -> None:
 def check_unsure(worlds: DifferentiableWorlds) -> None:
     """Refuse gradients where forces of contacts are not unique and motions depend on them."""
     found = worlds.unsure.nonzero().flatten().tolist()
-    if found:
+    if not found:
+        return
+    told = f"rollout: in world {found[0]} and {len(found) - 1} others "
+    if worlds.model.reduction is not None:
         raise Diverged(
-            f"rollout: in world {found[0]} and {len(found) - 1} others a reduced body slipped on more contacts than "
-            "its modes tell apart, so that how they share its load is not unique, and friction depends on it; give "
-            "the pair a compliance, or the reduction more modes for contact"
+            f"{told}a reduced body slipped on more contacts than its modes tell apart, so that how they share its "
+            "load is not unique, and friction depends on it; give the pair a compliance, or the reduction more modes "
+            "for contact"
         )
+    raise Diverged(
+        f"{told}contacts that repeat each other slipped, as along an edge that lies flat on a face, so that how they "
+        "share their load is not unique, and friction depends on it; give the pair a compliance"
+    )
 
 
 def _check_lagging(lagging: torch.Tensor) -> None:

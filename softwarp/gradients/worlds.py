@@ -241,7 +241,7 @@ class DifferentiableWorlds:
         self._unsure = [
             ((worlds.start, worlds.stop), wp.to_torch(pull.contact.unsure, requires_grad=False).flatten())
             for (worlds, _), pull in zip(twins, pulls, strict=True)
-            if model.reduction is not None and isinstance(pull, StepAdjoint) and pull.contact is not None
+            if isinstance(pull, StepAdjoint) and pull.contact is not None
         ]
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
@@ -326,7 +326,7 @@ class DifferentiableWorlds:
 
     @property
     def unsure(self) -> torch.Tensor:
-        """Worlds where modes did not tell apart contacts that slipped since ``start``, bool, (world,)."""
+        """Worlds where contacts that slipped repeated each other since ``start``, bool, (world,)."""
         return self._told(self._unsure)
 
     def _told(self, held: list[tuple[tuple[int, int], torch.Tensor]]) -> torch.Tensor:

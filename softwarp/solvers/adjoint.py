@@ -460,6 +460,8 @@ class StepAdjoint:
         if self.modes is not None:
             self.modes.to_state()
             if self.modes.frames is not None:
+                if self.contact is not None:
+                    self.contact.push_nodes(self.modes.frames.touch_p, self.modes.frames.touch_v)
                 self.modes.frames.to_state(self.index, self.p, self.q, self.corner)
         self._to_tractions()
 

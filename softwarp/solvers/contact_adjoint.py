@@ -123,6 +123,15 @@ class ContactAdjoint:
         self.laws.add_forces(y, -self.h)
         c.multiplier.copy_from(self.spare)
 
+    def push_nodes(self, by_p: Rows, by_v: Rows) -> None:
+        """h F and -h z on dofs, and behind them on nodes of reduced bodies, in the axes of the world."""
+        c = self.contacts
+        self.laws.push(self.h, by_p)
+        self.spare.copy_from(c.multiplier)
+        c.multiplier.copy_from(self.z)
+        self.laws.push(-self.h, by_v)
+        c.multiplier.copy_from(self.spare)
+
     def respond(self, y: Rows, p: Rows, q: Rows, gaps: Any, active: Rows, first: bool) -> None:
         """Change of q and z from the half-solved right-hand side, and its effect on that.
 

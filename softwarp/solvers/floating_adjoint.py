@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
 from softwarp.kernels.elements import adjoint as of_tets
@@ -73,6 +74,7 @@ class FloatingAdjoint:
 
     Attributes:
         own_v, own_p: v and p of nodes as their elements feel them without turning.
+        touch_p, touch_v: What contacts have by p and v of the nodes that touch something, behind those of dofs.
     """
 
     def __init__(self, shard: Shard, term: ReductionTerm, h: float, gradients: Gradients) -> None:
@@ -95,6 +97,10 @@ class FloatingAdjoint:
         self.corner, self.no_point = shard.rows(corners), shard.rows(3 * points)
         self.parameter: list[Rows] = []
         self.asks = True
+        touch = np.full(int(term.model.node.size), -1)
+        touch[term.model.touch_listed.numpy()] = np.arange(int(term.model.touch_listed.size))
+        self.listed_touch = wp.array(touch, dtype=wp.int32, device=shard.device)
+        self.touch_p, self.touch_v = (shard.rows(3 * shard.model.dof_room) for _ in range(2))
 
     def find_places(self) -> None:
         """Where all nodes were and are, and how bodies have turned on; needs the solution of the step."""
@@ -259,9 +265,11 @@ class FloatingAdjoint:
         points = [index.node_point_start, index.node_point, index.node_point_weight]
         inputs = [s.model.corner_start, s.model.corner, *points, corner.S, self.no_point.S]
         s.each(self.k_sums.node_sums, s.model.node_count, inputs, [self.element_bar.S])
-        inputs = [self.h, m.listed_start, m.listed, r.node, m.block, r.mode_dof, m.radius, *points, index.point_row]
+        inputs = [self.h, s.model.dof_count, m.listed_start, m.listed, self.listed_touch]
+        inputs += [r.node, m.block, r.mode_dof, m.radius, *points, index.point_row]
         inputs += [at.centre.real, at.x.real, self.own_v.real, self.own_p.real, w.dof_v.real, p.real]
         inputs += [w.point_gradient.real, w.multiplier.real, q.real, w.node_external.real, self.element_bar.real]
+        inputs += [self.touch_p.real, self.touch_v.real]
         s.each_real(self.k_pull.arm_bars, m.count, inputs, [self.arm.real, self.turn_bar.real])
 
     def finish(self) -> None:

@@ -307,10 +307,15 @@ class ContactResponse:
         if modes is None or modes.forces is None:
             self._push(self.size, self.size <= FEW_DOFS, f_scale, target)
             return
-        modes.forces.zero()
-        dofs = self.size + modes.touches
-        self._push(dofs, dofs <= FEW_TOUCHES, f_scale, modes.forces)
+        self.push(f_scale, modes.forces)
         modes.project(modes.forces, target)
+
+    def push(self, f_scale: float, target: Rows) -> None:
+        """Forces of contacts, times f, on dofs and behind them on nodes of reduced bodies, in the world's axes."""
+        assert self.subspace is not None
+        target.zero()
+        dofs = self.size + self.subspace.touches
+        self._push(dofs, dofs <= FEW_TOUCHES, f_scale, target)
 
     def _push(self, dofs: int, are_few: bool, f_scale: float, target: Rows) -> None:
         """The same on dofs, and on nodes that touch something behind them."""

@@ -223,9 +223,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def arm_bars(
         h: real,
+        dof_count: int,
         # Model
         listed_start: wp.array(dtype=wp.int32),
         listed: wp.array(dtype=wp.int32),
+        listed_touch: wp.array(dtype=wp.int32),
         node: wp.array(dtype=wp.int32),
         block: wp.array(dtype=wp.int32),
         mode_dof: wp.array(dtype=wp.int32),
@@ -246,11 +248,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         q_in: wp.array3d(dtype=real),
         external_in: wp.array3d(dtype=real),
         element_bar_in: wp.array3d(dtype=real),
+        touch_p_in: wp.array3d(dtype=real),
+        touch_v_in: wp.array3d(dtype=real),
         # Workspace out
         arm_bar_out: wp.array3d(dtype=real),
         turn_bar_out: wp.array3d(dtype=real),
     ):
-        """Gradients by the arms of one body's nodes and by its turn that rows and loads have.
+        """Gradients by the arms of one body's nodes and by its turn that rows, contacts and loads have.
 
         Elements have none by a turn: what their gradients by nodes will have is taken off.
         """
@@ -270,6 +274,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 g = vector_at(point_gradient_in, pack, lane, 3 * point) * (h * node_point_weight[entry])
                 along_p += g * multiplier_in[pack, point_row[point], lane]
                 along_v -= g * q_in[pack, point_row[point], lane]
+            touch = listed_touch[i]
+            if touch >= 0:
+                along_p += vector_at(touch_p_in, pack, lane, 3 * (dof_count + touch))
+                along_v += vector_at(touch_v_in, pack, lane, 3 * (dof_count + touch))
             put(arm_bar_out, pack, lane, 3 * i, wp.cross(along_p, p_w) + wp.cross(along_v, w))
             turn += wp.cross(vector_at(own_p_in, pack, lane, row), along_p)
             turn += wp.cross(vector_at(own_v_in, pack, lane, row), along_v)

@@ -13,8 +13,10 @@ from softwarp.gradients import Rollout, States
 from tests.gradient_cases import STEPS, Inputs, gradients
 from tests.reduction_cases import AIR, SLAB, quadratic_modes, reduced_by, scene
 from tests.unit.gradients import test_reduced
+from tests.unit.gradients.test_contact import EXACT, SLIPPING, STUCK
 from tests.unit.gradients.test_forward_frames import compare
 from tests.unit.gradients.test_rods import check
+from tests.unit.gradients.test_touches import modes as found_modes
 
 SIZES = {
     **test_reduced.SIZES,
@@ -31,6 +33,7 @@ def slab(
     law: Any = None,
     air: str = "volume",
     beside: bool = False,
+    on: str = "",
     **options: Any,
 ) -> sw.Simulation:
     """The free slab of ``reduction_cases`` with two thirds of its elements.
@@ -42,6 +45,7 @@ def slab(
         law: Material.
         air: Control of its chamber.
         beside: Whether a soft body that is not reduced is in the same scene.
+        on: What it touches: a "ball", a "floor" that is tilted, a soft "bed"; nothing for "".
         **options: Of the simulation.
     """
     builder = scene(held=False, contact=False, law=law, lone=air != "volume")
@@ -56,7 +60,13 @@ def slab(
         mesh = meshing.box((0.03, 0.02, 0.01), (2, 2, 1))
         other = builder.add_tets(mesh.nodes + 0.1, mesh.tets, material=sw.Corotational(5e4, 0.3), density=900.0)
         builder.fix(other, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 0.1001)))
-    model = builder.finalize(num_worlds=num_worlds, precision=precision, device=device)
+    if on:
+        laws = {"mu": 0.7, "compliance": test_reduced.SOFTNESS, "alarm_distance": 0.003, "contact_distance": 0.0005}
+        builder.add_contact(0, test_reduced.support(builder, on), **laws)
+        options = {"contact_passes": 0, **EXACT, **options}
+    model = builder.finalize(
+        num_worlds=num_worlds, precision=precision, device=device, contact_capacity=200 if on else None
+    )
     return sw.Simulation(model, dt=0.01, **options)
 
 
@@ -64,10 +74,13 @@ def given_of(sim: sw.Simulation, seeds: list[int]) -> Inputs:
     """Inputs of ``STEPS`` steps: tumbling bodies, each turned its own way."""
     given = test_reduced.given_of(sim, seeds, nodes=sim.model.own_node_count > 0)
     turns = [np.random.default_rng(100 + seed).standard_normal((1, 4)) for seed in seeds]
+    if sim.model.contact is not None:  # a little, so that it stays on what it touches
+        turns = [0.02 * turn + (0.0, 0.0, 0.0, 1.0) for turn in turns]
     turn = torch.tensor(np.stack(turns)).to(sim.node_x)
     given["state"]["mode_turn"] = turn / turn.norm(dim=-1, keepdim=True)
     given["state"]["mode_q"][:, 3:6] = 0.0
-    given["state"]["mode_v"][:, 3:6] *= 3.0
+    if sim.model.contact is None:
+        given["state"]["mode_v"][:, 3:6] *= 3.0
     return given
 
 
@@ -82,6 +95,9 @@ SCENES = {
     "of a projected law": partial(slab, law=sw.StableNeoHookean(1e5, 0.3)),
     "under pressure": partial(slab, air="pressure"),
     "beside a soft body, with gas": partial(slab, air="gas", beside=True),
+    "on a ball": partial(slab, on="ball"),
+    "on a floor": partial(slab, on="floor"),
+    "on a bed": partial(slab, on="bed"),
 }
 
 
@@ -89,12 +105,18 @@ SCENES = {
 def test_gradients_are_those_of_differences(name: str) -> None:
     """By amplitudes, velocities, turns, commands and all parameters."""
     sim = SCENES[name]()
-    check(Rollout(sim), given_of(sim, [1]), loss, SIZES)
+    given = given_of(sim, [1])
+    touches = sim.model.contact is not None
+    youngs = {"youngs": 10.0} if touches else {}  # more of it crosses a switch
+    check(Rollout(sim), given, loss, {**SIZES, "parameters": SIZES["parameters"] | youngs})
+    if touches:
+        assert found_modes(sim, given) & {STUCK, SLIPPING}
 
 
-def test_forward_mode_agrees() -> None:
+@pytest.mark.parametrize("on", ["", "ball"])
+def test_forward_mode_agrees(on: str) -> None:
     """By rows of modes and turns; nodes follow them: y . J d = d . J' y in every input."""
-    sim = slab()
+    sim = slab(on=on)
     compare(Rollout(sim), given_of(sim, [1]), loss)
 
 
@@ -104,6 +126,14 @@ def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
 ) -> None:
     """Three worlds that differ in all inputs, then each alone, with and without kept factors."""
     batch, single = (slab(count, precision, device, **options) for count in (3, 1))
+    test_reduced.equal_alone(batch, single, given_of, loss)
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_world_of_a_batch_that_touches_has_the_gradient_of_that_world_alone(precision: str) -> None:
+    """The same on a ball."""
+    exact = {} if precision == "float64" else {"gauss_seidel_tolerance": 1e-6}
+    batch, single = (slab(count, precision, on="ball", **exact) for count in (3, 1))
     test_reduced.equal_alone(batch, single, given_of, loss)
 
 

@@ -107,6 +107,27 @@ def test_what_carries_something_that_touches() -> None:
 
 
 @SLOW
+@pytest.mark.usefixtures("solves")
+def test_a_finger_on_a_free_box(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a modulus that changes by ten times as much: differences of less are rounding."""
+    monkeypatch.setattr(test_touches, "SIZES", larger(test_touches.SIZES, 1.0))
+    test_touches.SIZES["parameters"]["youngs"] *= 10.0
+    test_touches.test_a_finger_on_a_base("box")
+
+
+@pytest.mark.usefixtures("solves")
+def test_an_edge_that_lies_flat_and_slips() -> None:
+    """Three contacts in a line press as two do: how they share that, and friction with it, a compliance tells alone."""
+    sim, given = test_touches.hit_block("free")
+    with pytest.raises(Diverged, match=r"world 0 and 0 others contacts that repeat each other slipped.*compliance"):
+        gradients(Rollout(sim), given, test_touches.loss)
+    sim, given = test_touches.hit_block("free", compliance=1e-5)
+    sizes = larger(test_touches.SIZES, 1.0)
+    sizes["state"] |= {"body_pose": 1e-8, "body_twist": 1e-6}  # more of them crosses a switch
+    check(Rollout(sim), given, test_touches.loss, sizes)
+
+
+@SLOW
 @pytest.mark.parametrize("relaxes", [False, True])
 @pytest.mark.parametrize("base", ["free", "kinematic"])
 def test_contact_by_every_input(base: str, relaxes: bool) -> None:

@@ -220,8 +220,7 @@ def test_a_finger_on_a_base(other: str) -> None:
     assert modes(sim, {"state": given["state"]}) & {STUCK, SLIPPING}
 
 
-@pytest.mark.parametrize("base", ["kinematic", pytest.param("free", marks=pytest.mark.slow)])
-def test_a_body_that_carries_something_and_is_touched(base: str) -> None:
+def hit_block(base: str, **laws: float) -> tuple[sw.Simulation, Inputs]:
     """A soft cube on one side of a block, and another one that hits the other side."""
     builder = sw.ModelBuilder(gravity=(0.3, 0.2, -9.81))
     body = cube(builder)
@@ -232,11 +231,18 @@ def test_a_body_that_carries_something_and_is_touched(base: str) -> None:
     thrown_one = builder.add_tets(
         small.nodes + (-0.08, 0.03, 0.03), small.tets, material=sw.Corotational(1e5, 0.4), density=1e3
     )
-    builder.add_contact(thrown_one, block, mu=0.5)
+    builder.add_contact(thrown_one, block, mu=0.5, **laws)
     builder.add_marker(block, (0.01, 0.0, 0.0))
     sim = made(builder)
     given = thrown(sim, 0.0, 0.1, (2,))
     given["state"]["node_v"][:, 27:, 0] = 0.3
+    return sim, given
+
+
+@pytest.mark.parametrize("base", ["kinematic", pytest.param("free", marks=pytest.mark.slow)])
+def test_a_body_that_carries_something_and_is_touched(base: str) -> None:
+    """What a block carries, and what hits it."""
+    sim, given = hit_block(base)
     check(Rollout(sim), given, loss, SIZES)
     assert modes(sim, given) & {STUCK, SLIPPING}
 
