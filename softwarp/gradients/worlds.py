@@ -232,17 +232,13 @@ class DifferentiableWorlds:
         self.failed, self.unfinished, self.lagging = (
             torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(3)
         )
-        self._adrift = [
-            ((worlds.start, worlds.stop), wp.to_torch(part.adrift, requires_grad=False).flatten())
+        stages: list[tuple[tuple[int, int], StepAdjoint]] = [
+            ((worlds.start, worlds.stop), part)
             for (worlds, _), pull in zip(twins, pulls, strict=True)
             for part in (pull.pulls if isinstance(pull, SecondOrderAdjoint) else [pull])
-            if isinstance(part, NewtonAdjoint)
         ]
-        self._unsure = [
-            ((worlds.start, worlds.stop), wp.to_torch(pull.contact.unsure, requires_grad=False).flatten())
-            for (worlds, _), pull in zip(twins, pulls, strict=True)
-            if isinstance(pull, StepAdjoint) and pull.contact is not None
-        ]
+        self._adrift = [(at, _flags(part.adrift)) for at, part in stages if isinstance(part, NewtonAdjoint)]
+        self._unsure = [(at, _flags(part.contact.unsure)) for at, part in stages if part.contact is not None]
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
@@ -396,3 +392,9 @@ def _adjoint(
         return JointStepAdjoint(steps.system, steps.h, gradients, index)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint
     return kind(steps.system, steps.h, gradients, index, rest=rest)
+
+
+def _flags(array: wp.array) -> torch.Tensor:
+    """A flag of every world, as the adjoints have them."""
+    flags: torch.Tensor = wp.to_torch(array, requires_grad=False).flatten()
+    return flags

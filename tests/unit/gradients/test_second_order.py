@@ -7,10 +7,10 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
-from softwarp.gradients import Rollout
+from softwarp.gradients import Diverged, Rollout
 from softwarp.solvers.second_order_adjoint import SecondOrderAdjoint
 from tests.gradient_cases import Inputs, cube, gradients, inputs, weights
-from tests.unit.gradients import test_contact, test_every_input
+from tests.unit.gradients import test_contact, test_every_input, test_touches
 from tests.unit.gradients.test_adjoint import check
 from tests.unit.gradients.test_contact import EXACT, OPEN, SIDE, SLIPPING, STUCK
 from tests.unit.gradients.test_forward_frames import compare
@@ -163,3 +163,10 @@ def test_a_gpu_finds_the_same() -> None:
         for name, value in held.items():
             size = float(value.abs().max())
             torch.testing.assert_close(found[1][group][name].cpu(), value, rtol=1e-6, atol=1e-7 * size)
+
+
+def test_contacts_that_repeat_each_other_and_slip_are_told() -> None:
+    """Three in a line press as two do, in a stage of a step as in a whole one."""
+    sim, given = test_touches.hit_block("free")
+    with pytest.raises(Diverged, match=r"world 0 and 0 others contacts that repeat each other slipped.*compliance"):
+        gradients(Rollout(second(sim, contact_passes=0)), given, test_touches.loss)
