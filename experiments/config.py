@@ -9,6 +9,7 @@ import types
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import hydra
@@ -62,7 +63,11 @@ class TrainConfig(RunConfig):
 
 def env_schema(name: str) -> type:
     """Dataclass of an environment's options as OmegaConf takes them: its name added, tuples declared as lists."""
-    config_class = registry.spec(name).config_class()
+    return _schema(name, registry.spec(name).config_class())
+
+
+@cache
+def _schema(name: str, config_class: type) -> type:
     hints = typing.get_type_hints(config_class)
     defaults = config_class()
     fields: list[Any] = [("name", str, field(default=name))]
@@ -92,18 +97,27 @@ def _plain_type(hint: Any) -> Any:
 
 def register(primary: dict[str, type], envs: Sequence[str] = ()) -> None:
     """Make all schemas known to Hydra; ``primary`` maps a verb to its dataclass, ``envs`` are those needed if known."""
-    store = ConfigStore.instance()
     for verb, schema in primary.items():
-        store.store(name=f"{verb}_schema", node=schema)
+        _store(f"{verb}_schema", schema)
     for name in registry.names():
         if not envs or registry.spec(name).file_name in envs:
-            store.store(group="env", name=registry.spec(name).file_name, node=env_schema(name))  # needs no file
+            _store(registry.spec(name).file_name, env_schema(name), "env")  # needs no file
     for name, schema in algorithms.CONFIGS.items():
-        store.store(group="algo", name=f"{name}_schema", node=schema)
+        _store(f"{name}_schema", schema, "algo")
     for name, planner_schema in planners.CONFIGS.items():
-        store.store(group="planner", name=f"{name}_schema", node=planner_schema)
-    store.store(group="network", name="mlp_schema", node=NetworkConfig)
-    store.store(group="logger", name="logger_schema", node=LoggerConfig)
+        _store(f"{name}_schema", planner_schema, "planner")
+    _store("mlp_schema", NetworkConfig, "network")
+    _store("logger_schema", LoggerConfig, "logger")
+
+
+_stored: dict[tuple[str | None, str], type] = {}  # by group and name
+
+
+def _store(name: str, node: type, group: str | None = None) -> None:
+    """Make a schema known to Hydra, which takes a while, unless it is."""
+    if _stored.get((group, name)) is not node:
+        ConfigStore.instance().store(name, node, group)
+        _stored[group, name] = node
 
 
 def compose(verb: str, schema: type, overrides: list[str]) -> Any:
@@ -165,7 +179,7 @@ def with_own_environments(overrides: list[str]) -> list[str]:
         if place not in OWN:
             registry.spec(place).env_class()  # after this its package is found, with its settings
             OWN[place] = f"own_{len(OWN)}_{registry.spec(place).file_name}"
-        ConfigStore.instance().store(group="env", name=OWN[place], node=env_schema(place))
+        _store(OWN[place], env_schema(place), "env")
         return OWN[place]
 
     def replaced(text: str) -> str:
