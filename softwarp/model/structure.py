@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 IntArray = NDArray[np.int32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Symbolic:
     """Structure of ``P A P' = L L'`` for one symmetric pattern of 3x3 blocks; every index is in elimination order.
 

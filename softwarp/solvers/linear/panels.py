@@ -2,7 +2,7 @@
 
 Columns along a path of the elimination tree that nearly share their pattern become one panel with a common list of
 rows, at the price of some blocks that hold zeros. Panels that do not depend on each other share a round. Runs once per
-solver, on the host. Theory: docs/theory/cholesky.md.
+structure, on the host. Theory: docs/theory/cholesky.md.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,8 +91,18 @@ def fits(symbolic: Symbolic, limits: Limits) -> bool:
     return _fits(1, below, limits)
 
 
+_schedules: WeakKeyDictionary[Symbolic, dict[Limits, Panels]] = WeakKeyDictionary()
+
+
 def schedule(symbolic: Symbolic, limits: Limits) -> Panels:
-    """Group the columns of a structure into panels, and these into rounds."""
+    """Group the columns of a structure into panels, and these into rounds; once for all systems that have it."""
+    made = _schedules.setdefault(symbolic, {})
+    if limits not in made:
+        made[limits] = _schedule(symbolic, limits)
+    return made[limits]
+
+
+def _schedule(symbolic: Symbolic, limits: Limits) -> Panels:
     n = symbolic.size
     structure = [symbolic.l_row[symbolic.col_start[j] : symbolic.col_start[j + 1]] for j in range(n)]
     groups = _amalgamate(structure, symbolic.parent, limits)

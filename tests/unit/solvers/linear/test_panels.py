@@ -57,6 +57,7 @@ def test_rounds_keep_their_limits(limits: panels.Limits) -> None:
     """Every column and every block of A has its place, whatever a round can hold."""
     structure = bar((8, 3, 2))
     plan = panels.schedule(structure, limits)
+    assert panels.schedule(structure, limits) is plan
     assert np.diff(plan.round_item).max() <= limits.items
     assert np.diff(plan.turn_lower).max() <= 9 * limits.stage
     assert plan.item_place[:, :2].max() < limits.slots
