@@ -136,7 +136,8 @@ def _nested_dissection(edges: IntArray, points: FloatArray, leaf: int, *, is_lar
         if is_large:
             is_low, separator = _best_cut(graph, nodes, x)
         else:
-            is_low = _first_along(x[:, int(np.argmax(np.ptp(x, axis=0)))], 0.5)
+            along = x[:, int(np.argmax(np.ptp(x, axis=0)))]
+            is_low = _first_of(np.argsort(along, kind="stable"), 0.5)
             separator = _separator(graph, nodes, is_low)
         low, high = nodes[is_low & ~separator], nodes[~is_low & ~separator]
         if low.size == 0 or high.size == 0:
@@ -151,11 +152,18 @@ def _nested_dissection(edges: IntArray, points: FloatArray, leaf: int, *, is_lar
     return np.concatenate(result).astype(np.int32)
 
 
-def _first_along(place: FloatArray, share: float) -> NDArray[np.bool_]:
-    """Whether points are among a share of them that lies lowest along a direction."""
-    result = np.zeros(place.size, dtype=bool)
-    result[np.argsort(place, kind="stable")[: int(share * place.size)]] = True
+def _first_of(order: NDArray[np.intp], share: float) -> NDArray[np.bool_]:
+    """Whether points are among a share of them that comes first in an order."""
+    result = np.zeros(order.size, dtype=bool)
+    result[order[: int(share * order.size)]] = True
     return result
+
+
+def _distinct(values: IntArray, count: int) -> int:
+    """How many of the numbers below a count there are."""
+    is_there = np.zeros(count, dtype=bool)
+    is_there[values] = True
+    return int(is_there.sum())
 
 
 def _best_cut(graph: csr_array, nodes: IntArray, x: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -170,10 +178,11 @@ def _best_cut(graph: csr_array, nodes: IntArray, x: FloatArray) -> tuple[NDArray
     cuts = []
     for angle in angles:
         place = np.cos(angle) * x[:, across[0]] + np.sin(angle) * x[:, across[1]]
+        order = np.argsort(place, kind="stable")
         for share in SHARES:
-            is_low = _first_along(place, share)
+            is_low = _first_of(order, share)
             is_cut = is_low[local.row] & ~is_low[local.col]
-            size = min(np.unique(local.row[is_cut]).size, np.unique(local.col[is_cut]).size)
+            size = min(_distinct(end[is_cut], nodes.size) for end in (local.row, local.col))
             cuts.append((size * (0.5 + max(share, 1.0 - share)), is_low))
     order = sorted(range(len(cuts)), key=lambda k: cuts[k][0])[:FINALISTS]
     best: tuple[float, NDArray[np.bool_], NDArray[np.bool_]] | None = None
