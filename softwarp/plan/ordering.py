@@ -178,9 +178,9 @@ def _best_cut(graph: csr_array, nodes: IntArray, x: FloatArray) -> tuple[NDArray
     cuts = []
     for angle in angles:
         place = np.cos(angle) * x[:, across[0]] + np.sin(angle) * x[:, across[1]]
-        order = np.argsort(place, kind="stable")
+        sorted_nodes = np.argsort(place, kind="stable")
         for share in SHARES:
-            is_low = _first_of(order, share)
+            is_low = _first_of(sorted_nodes, share)
             is_cut = is_low[local.row] & ~is_low[local.col]
             size = min(_distinct(end[is_cut], nodes.size) for end in (local.row, local.col))
             cuts.append((size * (0.5 + max(share, 1.0 - share)), is_low))
