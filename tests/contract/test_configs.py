@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from experiments import config
@@ -201,3 +202,11 @@ def test_settings_are_found_where_installed(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [str(package / "__init__.py"), str(package / "hydra_configs"), "Trunk"]
+
+
+def test_a_schema_that_changes_is_told_anew():
+    """Hydra keeps those that it has been told, but not where another one takes the name."""
+    for number in (1, 2):
+        made = dataclasses.make_dataclass("Probe", [("probed", int, number)])
+        config.register({"probe": made})
+        assert ConfigStore.instance().load("probe_schema.yaml").node.probed == number
