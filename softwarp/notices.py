@@ -39,6 +39,8 @@ class Line:
         every: Seconds between two lines where it is no terminal.
     """
 
+    latest: Line | None = None  # that was shown, of all
+
     def __init__(self, every: float = PLAIN_SECONDS) -> None:
         self.every = every
         self._told_at = -math.inf
@@ -50,8 +52,14 @@ class Line:
         if now - self._told_at < (RENEW_SECONDS if is_terminal else self.every):
             return
         self._told_at, self._is_open = now, is_terminal
+        Line.latest = self
         width = shutil.get_terminal_size().columns - 1  # a line that wraps cannot be renewed
         _write(f"\r\x1b[K{text[:width]}" if is_terminal else f"{text}\n")
+
+    @property
+    def is_told(self) -> bool:
+        """Whether it was shown so lately that it will be soon again, if it has not ended."""
+        return time.monotonic() - self._told_at < self.every + 1.0
 
     def clear(self) -> None:
         """Make room for what others write, until the line is shown again."""
@@ -118,6 +126,8 @@ def progress_ends() -> None:
 def working(what: str) -> Iterator[None]:
     """Meanwhile it is told that work goes on which cannot say how far it has come; as ``progress`` otherwise.
 
+    Another line that is shown meanwhile, such as that of compiling, tells enough until it ends.
+
     Args:
         what: The work.
     """
@@ -129,7 +139,8 @@ def working(what: str) -> Iterator[None]:
     def tell() -> None:
         line, wait = Line(), WAIT_SECONDS
         while not is_over.wait(wait):
-            line.show(f"{what}: {time.monotonic() - begun:.0f} s")
+            if Line.latest is None or Line.latest is line or not Line.latest.is_told:
+                line.show(f"{what}: {time.monotonic() - begun:.0f} s")
             wait = RENEW_SECONDS
         line.end()
 

@@ -163,3 +163,12 @@ def test_work_without_steps_is_told(monkeypatch, capfd):
     told = capfd.readouterr().err
     assert told.startswith("\r\x1b[Kbuilding: 0 s") and told.endswith("\r\x1b[K")
     assert "softwarp-working" not in {thread.name for thread in threading.enumerate()}
+    other = notices.Line()
+    other.show("compiling")
+    with notices.telling(), notices.working("building"):
+        time.sleep(0.2)
+    other.end()
+    assert "building" not in capfd.readouterr().err
+    with notices.telling(), notices.working("building"):
+        time.sleep(0.2)
+    assert "building" in capfd.readouterr().err
