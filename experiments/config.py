@@ -110,14 +110,13 @@ def register(primary: dict[str, type], envs: Sequence[str] = ()) -> None:
     _store("logger_schema", LoggerConfig, "logger")
 
 
-_stored: dict[tuple[str | None, str], type] = {}  # by group and name
-
-
-def _store(name: str, node: type, group: str | None = None) -> None:
-    """Make a schema known to Hydra, which takes a while, unless it is."""
-    if _stored.get((group, name)) is not node:
-        ConfigStore.instance().store(name, node, group)
-        _stored[group, name] = node
+def _store(name: str, schema: type, group: str | None = None) -> None:
+    """Make a schema known to Hydra, which takes a while, unless it is the one that Hydra holds under that name."""
+    store = ConfigStore.instance()
+    held = store.repo.get(group, {}) if group else store.repo
+    told = held.get(f"{name}.yaml")
+    if told is None or OmegaConf.get_type(told.node) is not schema:
+        store.store(name, schema, group)
 
 
 def compose(verb: str, schema: type, overrides: list[str]) -> Any:

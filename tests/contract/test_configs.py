@@ -205,8 +205,11 @@ def test_settings_are_found_where_installed(tmp_path):
 
 
 def test_a_schema_that_changes_is_told_anew():
-    """Hydra keeps those that it has been told, but not where another one takes the name."""
-    for number in (1, 2):
-        made = dataclasses.make_dataclass("Probe", [("probed", int, number)])
-        config.register({"probe": made})
+    """Hydra keeps those that it has been told, but not where another one takes the name, whoever told of that one."""
+    made = [dataclasses.make_dataclass("Probe", [("probed", int, number)]) for number in (1, 2)]
+    for number, schema in enumerate(made, start=1):
+        config.register({"probe": schema})
         assert ConfigStore.instance().load("probe_schema.yaml").node.probed == number
+    ConfigStore.instance().store("probe_schema", made[0])  # as a second copy of this module does
+    config.register({"probe": made[1]})
+    assert ConfigStore.instance().load("probe_schema.yaml").node.probed == 2
