@@ -2,7 +2,7 @@
 
 A finger of 657 nodes, clamped at its base, is pressed with a pad under its end on a cube that slides to and fro across
 it with friction, in every world at another speed; about twenty contacts carry force.
-A step with contact takes about twice the time of the same scene without the contact pair, which
+A step with contact takes about 1.4 times the time of the same scene without the contact pair, which
 ``python -m benchmarks.contact --json FILE`` measures: both on one core in turns, in processor time.
 """
 

@@ -36,6 +36,7 @@ from softwarp.plan.sampled import with_points
 from softwarp.plan.soft import SoftLayout, soft_arrays, soft_elements, soft_layout, tet_elements
 from softwarp.plan.structure import Elements, ModeBlocks, Points, Structure, structure
 from softwarp.plan.telescopes import check_telescopes, telescope_model
+from softwarp.plan.touching import expected_touch
 from softwarp.plan.tractions import traction_model
 from softwarp.plan.upload import checked_device, upload
 from softwarp.scene.parts import Scene
@@ -69,7 +70,7 @@ def plan(scene: Scene, num_worlds: int, device: str, precision: str, contact_cap
         )
     scene = with_points(scene)
     parts = _layouts(scene)
-    found = _structure(scene, parts)
+    found = _structure(scene, parts, is_cpu=device == "cpu")
     model = _model(scene, parts, found, contact_capacity)
     given = replace(model, num_worlds=int(num_worlds), device=device, precision=precision)
     refuse_far(given)
@@ -121,8 +122,9 @@ def _layouts(scene: Scene) -> _Layouts:
     )
 
 
-def _structure(scene: Scene, parts: _Layouts) -> Structure:
+def _structure(scene: Scene, parts: _Layouts, *, is_cpu: bool) -> Structure:
     soft, frames = parts.soft, parts.frames
+    is_turned = scene.pairs and is_cpu and not _is_order_in_digest(scene, parts)
     return structure(
         soft.nodes,
         soft.fixed,
@@ -134,7 +136,14 @@ def _structure(scene: Scene, parts: _Layouts) -> Structure:
         frames,
         contacts=min(expected_contacts(scene) // 2, USUAL_CONTACTS),
         modes=parts.modes,
+        touch=expected_touch(scene, soft, frames) if is_turned else None,
     )
+
+
+def _is_order_in_digest(scene: Scene, parts: _Layouts) -> bool:
+    """Whether a part's digest has lists in elimination order, which may not change and are the same on every device."""
+    has_tangent = any(scene.bodies[c.body].material.kernel_law not in TURNED for c in scene.cavities)
+    return has_tangent or bool(parts.thin) or parts.modes is not None or bool(scene.telescopes)
 
 
 def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: int | None) -> Model:

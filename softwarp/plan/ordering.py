@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softwarp.model.structure import Symbolic
+from softwarp.plan.turning import turn
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -34,7 +35,13 @@ FINALISTS = 10  # cuts with the fewest blocks along them, whose separators are f
 _analyzed: WeakValueDictionary[bytes, Symbolic] = WeakValueDictionary()
 
 
-def analyze(edges: IntArray, count: int, points: FloatArray | None = None, contacts: int = 0) -> Symbolic:
+def analyze(
+    edges: IntArray,
+    count: int,
+    points: FloatArray | None = None,
+    contacts: int = 0,
+    touch: FloatArray | None = None,
+) -> Symbolic:
     """Order and factorise the pattern of a symmetric block matrix symbolically.
 
     Args:
@@ -43,6 +50,8 @@ def analyze(edges: IntArray, count: int, points: FloatArray | None = None, conta
         points: Positions of the rows [m], shape (n, 3). With them, nested dissection competes with minimum degree.
         contacts: Contacts to expect at a time. Each one costs a substitution along its path to the root, and each two
             of them a product along what they share of it, so a bushy tree may pay for a larger factor.
+        touch: How many ends of a contact are expected at every row; the tree is then turned towards them, whatever its
+            depth, with which it takes longer on a GPU.
 
     Returns:
         The structure with the cheapest ordering: fewest operations, a shallower tree breaking near ties.
@@ -54,13 +63,16 @@ def analyze(edges: IntArray, count: int, points: FloatArray | None = None, conta
     places = None if points is None else np.asarray(points, dtype=np.float64)
     digest = hashlib.sha256(repr((count, contacts, edges.shape, points is None)).encode() + edges.tobytes())
     digest.update(b"" if places is None else places.tobytes())
+    digest.update(b"" if touch is None else touch.tobytes())
     found = _analyzed.get(digest.digest())
     if found is None:
-        found = _analyzed[digest.digest()] = _analyze(edges, count, places, contacts)
+        found = _analyzed[digest.digest()] = _analyze(edges, count, places, contacts, touch)
     return found
 
 
-def _analyze(edges: IntArray, count: int, points: FloatArray | None, contacts: int) -> Symbolic:
+def _analyze(
+    edges: IntArray, count: int, points: FloatArray | None, contacts: int, touch: FloatArray | None
+) -> Symbolic:
     """As ``analyze``, of edges without duplicates."""
     candidates = [_minimum_degree(edges, count)]
     leaves = (LARGE_LEAF,) if count >= LARGE else LEAF_SIZES if contacts else LEAF_SIZES[:1]
@@ -75,7 +87,12 @@ def _analyze(edges: IntArray, count: int, points: FloatArray | None, contacts: i
         if best is None or score < best[0]:
             best = (score, order, structure)
     assert best is not None
-    return _schedule(edges, best[1], best[2])
+    _, order, structure = best
+    turned = None if touch is None or not contacts else turn(structure, touch[order], contacts)
+    if turned is not None:
+        order = order[turned]
+        structure = _factor_pattern(edges, order)
+    return _schedule(edges, order, structure)
 
 
 def _products(structure: list[IntArray], contacts: int) -> float:

@@ -257,6 +257,7 @@ def structure(
     with_segments: int = 0,
     contacts: int = 0,
     modes: ModeBlocks | None = None,
+    touch: FloatArray | None = None,
     ties: IntArray | None = None,
 ) -> Structure:
     """Order the unknowns of a scene and list what every block of A and every entry of H receives.
@@ -273,6 +274,7 @@ def structure(
         with_segments: Cables whose segments' ends A couples.
         contacts: Contacts to expect at a time.
         modes: Modes of reduced bodies.
+        touch: How many ends of a contact are expected at every slot but those of modes.
         ties: Pairs of nodes that A couples besides those of elements, (tie, 2).
     """
     slots = Slots(fixed, locked, frames, modes)
@@ -291,7 +293,9 @@ def structure(
         edges += _mode_edges(slots, modes)
         where = np.concatenate([where, np.repeat(modes.centre, np.diff(modes.start), axis=0)])
     pairs = np.concatenate(edges) if edges else np.empty((0, 2), dtype=np.int64)
-    symbolic = analyze(pairs[(pairs >= 0).all(axis=1)].astype(np.int32), slots.size, where, contacts)
+    if touch is not None:
+        touch = touch[slots.slot]
+    symbolic = analyze(pairs[(pairs >= 0).all(axis=1)].astype(np.int32), slots.size, where, contacts, touch)
     slots.ordered(symbolic.position)
     return Structure(
         symbolic=symbolic,

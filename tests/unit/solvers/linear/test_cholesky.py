@@ -56,7 +56,7 @@ def bar_pattern() -> tuple[np.ndarray, int, np.ndarray]:
     return np.concatenate([mesh.tets[:, pair] for pair in pairs]), len(mesh.nodes), mesh.nodes
 
 
-@pytest.fixture(params=["mesh", "contacts", "searched", "random", "isolated", "full"])
+@pytest.fixture(params=["mesh", "contacts", "turned", "searched", "random", "isolated", "full"])
 def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> Symbolic:
     if request.param == "searched":  # as models of thousands of blocks
         monkeypatch.setattr(ordering, "LARGE", 20)
@@ -65,6 +65,10 @@ def symbolic(request: pytest.FixtureRequest, rng: np.random.Generator, monkeypat
         return analyze(*mesh_pattern())
     if request.param == "contacts":
         return analyze(*mesh_pattern(), contacts=24)
+    if request.param == "turned":
+        edges, count, nodes = bar_pattern()
+        near = nodes[:, 0] > 2.75
+        return analyze(edges, count, nodes, 24, near / near.sum())
     patterns = {"mesh": mesh_pattern, "random": lambda: random_pattern(rng), "isolated": isolated_pattern}
     patterns["full"] = full_pattern
     return analyze(*patterns[request.param]())
