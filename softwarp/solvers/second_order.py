@@ -160,9 +160,8 @@ class SecondOrder:
         model = self.system.model
         held, frames = model.prescribed_dof.numpy(), model.frames
         if frames is not None:
-            place = (model.dof_node.numpy()[held] - model.node_count) // 2
-            is_rigid = (place >= 0) & (place < frames.rigid_count)
-            held = held[~is_rigid | ~frames.is_kinematic[np.where(is_rigid, place, 0)]]
+            driven = np.flatnonzero(frames.is_kinematic)
+            held = held[~np.isin((model.dof_node.numpy()[held] - model.node_count) // 2, driven)]
         return wp.array(held, dtype=wp.int32, device=self.shard.device)
 
     @property

@@ -335,6 +335,18 @@ def test_velocities_along_held_axes_count_for_nothing(integrator, precision):
     assert not pushed.node_v[:, corner, 1].any() and not pushed.body_twist[:, cart, 1:].any()
 
 
+@pytest.mark.parametrize("integrator", ["bdf2", "trapezoidal"])
+def test_a_clamped_rod_alone(integrator):
+    """Its frames are its nodes, none of them a rigid body."""
+    builder = sw.ModelBuilder()
+    line = builder.add_rod(np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 5), radius=0.01, youngs=1e6)
+    builder.fix(line, nodes=[0])
+    sim = simulation(builder, 0.01, integrator)
+    sim.rod_v[:, 0] = 0.5
+    sim.step(3)
+    assert not sim.rod_v[:, 0].any() and float(sim.rod_x[0, -1, 2]) < -1e-4
+
+
 def test_trapezoidal_is_bdf2_with_rows():
     """Multipliers would ring."""
     a, b = (tension(0.01, name) for name in ("trapezoidal", "bdf2"))
