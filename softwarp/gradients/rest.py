@@ -41,6 +41,8 @@ class RestShape:
         self.held = torch.as_tensor(model.node_fixed[:, None] | model.node_locked).to(like)
         self._lengths = self._slopes(model, like)
 
+    @torch.inference_mode(False)
+    @torch.enable_grad()  # whoever makes this may take no gradients
     def _slopes(self, model: Model, like: torch.Tensor) -> torch.Tensor:
         """Slope of every length at rest by the rest positions, (cable, node, 3)."""
         node = torch.as_tensor(model.point_node.numpy().reshape(-1, 4)).long()[: model.point_count]

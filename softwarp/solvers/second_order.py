@@ -136,7 +136,7 @@ class SecondOrder:
         self.is_free = system.contact is None and model.row_count == 0
         self.stages = TRAPEZOIDAL if system.options.integrator == "trapezoidal" and self.is_free else BDF2
         self.base = self.start  # of extrapolations
-        self.told = self._told()
+        self.told, self.held = self._told(), self._held()
         if self._keeps_twice:
             self.base = {name: self._like(array) for name, array in self.moving.items()}
         self.smooth = {name: self._like(array) for name, array in self.arrays.items()}
@@ -154,6 +154,15 @@ class SecondOrder:
         if frames is not None and self.stages is TRAPEZOIDAL:
             told[: frames.rigid_count] = frames.is_kinematic
         return wp.array(told, dtype=wp.int32, device=self.shard.device)
+
+    def _held(self) -> wp.array:
+        """Dofs that are held along axes, but for those of kinematic bodies."""
+        model = self.system.model
+        held, frames = model.prescribed_dof.numpy(), model.frames
+        if frames is not None:
+            driven = np.flatnonzero(frames.is_kinematic)
+            held = held[~np.isin((model.dof_node.numpy()[held] - model.node_count) // 2, driven)]
+        return wp.array(held, dtype=wp.int32, device=self.shard.device)
 
     @property
     def _keeps_twice(self) -> bool:
@@ -201,8 +210,15 @@ class SecondOrder:
             self.system.refresh()  # it ends in an extrapolation
 
     def keep(self) -> None:
-        """Note the state as that of the start."""
+        """Note the state as that of the start, without velocities along axes that are held: no stage leaves any."""
+        self.hold(*(getattr(self.system.state, name) for name in ("node_v", "frame_twist")))
         self.copy(ALL, self.rough, self.arrays, self.start)
+
+    def hold(self, node_v: wp.array, twist: wp.array) -> None:
+        """Velocities, or gradients by them, become 0 along axes that are held."""
+        s, m = self.shard, self.system.model
+        inputs = [s.lanes, m.node_count, self.held, m.dof_node, m.dof_free]
+        s.each_real(self.k.hold, self.held.size, inputs, [node_v, twist])
 
     def give_back(self) -> None:
         """The start's state once more."""

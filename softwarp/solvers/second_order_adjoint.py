@@ -87,10 +87,16 @@ class SecondOrderAdjoint:
     def step(self) -> None:
         """Gradients by the end of the step from the system's state become those by its start."""
         self._step(parameters=True)
+        self._hold()
 
     def step_alone(self) -> None:
         """The same without gradients by parameters."""
         self._step(parameters=False)
+        self._hold()
+
+    def _hold(self) -> None:
+        """Velocities at the start count for nothing along axes that are held."""
+        self.stepper.hold(self.gradients.node_v, self.gradients.frame_twist)
 
     def _step(self, *, parameters: bool) -> None:
         stepper, (first, second) = self.stepper, self.stepper.stages

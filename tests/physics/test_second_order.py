@@ -309,6 +309,44 @@ def test_velocity_commands(integrator):
     torch.testing.assert_close(sim.body_twist, sim.control.body_velocity, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("integrator", ["euler", "bdf2", "trapezoidal"])
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_velocities_along_held_axes_count_for_nothing(integrator, precision):
+    """Of a node on a roller, a cart on rails and the clamped end of a rod; extrapolations once kept them for ever."""
+    builder, body = beam()
+    corner = builder.fix(body, box=((0.0999, -1.0, -1.0), (1.0, 1e-4, 1e-4)), axes="y")
+    cart = builder.add_rigid(mass=0.1, inertia=(1e-5,) * 3, pose=(0.0, 0.1, 0.0), free_axes="x")
+    line = builder.add_rod([(0.0, 0.2, 0.0), (0.05, 0.2, 0.0)], radius=0.01, youngs=1e6, rayleigh=(0.0, 0.005))
+    builder.fix(line, nodes=[0])
+    pushed, plain = (simulation(builder, 0.01, integrator, 4, precision) for _ in range(2))
+    for sim in (pushed, plain):
+        sim.body_twist[:, cart, 0] = 0.2
+    pushed.node_v[:, corner, 1] = 0.3
+    pushed.body_twist[:, cart, 1:] = 0.4
+    pushed.rod_v[:, 0], pushed.rod_w[:, 0] = 0.5, 0.6
+    for _ in range(3):
+        pushed.step()
+        plain.step()
+        for name in ("node_x", "node_v", "body_pose", "body_twist", "rod_x", "rod_q", "rod_v", "rod_w"):
+            if integrator != "euler":
+                assert torch.equal(getattr(pushed, name), getattr(plain, name)), name
+            tolerance = 1e-5 if precision == "float32" else 1e-13
+            assert (getattr(pushed, name) - getattr(plain, name)).abs().max() < tolerance, name
+    assert not pushed.node_v[:, corner, 1].any() and not pushed.body_twist[:, cart, 1:].any()
+
+
+@pytest.mark.parametrize("integrator", ["bdf2", "trapezoidal"])
+def test_a_clamped_rod_alone(integrator):
+    """Its frames are its nodes, none of them a rigid body."""
+    builder = sw.ModelBuilder()
+    line = builder.add_rod(np.linspace((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), 5), radius=0.01, youngs=1e6)
+    builder.fix(line, nodes=[0])
+    sim = simulation(builder, 0.01, integrator)
+    sim.rod_v[:, 0] = 0.5
+    sim.step(3)
+    assert not sim.rod_v[:, 0].any() and float(sim.rod_x[0, -1, 2]) < -1e-4
+
+
 def test_trapezoidal_is_bdf2_with_rows():
     """Multipliers would ring."""
     a, b = (tension(0.01, name) for name in ("trapezoidal", "bdf2"))

@@ -13,12 +13,14 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.collision import geometry, strike
 from softwarp.kernels.collision.geometry import (
+    APART,
     BARY,
     DISTANCE,
     NORMAL,
     POINT_A,
     POINT_B,
     SHARE,
+    TURNED,
 )
 from softwarp.model.codes import FAR, SLOTS, WORLD, Carrier, CoupleColumn, Target
 
@@ -166,6 +168,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 most = wp.max(most, count[pack, 0, other])
         return most
 
+    @wp.func
+    def is_there(
+        pack: int,
+        lane: int,
+        c: int,
+        n: vec3,
+        first: wp.array3d(dtype=wp.int32),
+        key: wp.array3d(dtype=wp.int32),
+        axes: wp.array3d(dtype=real),
+    ):
+        """Whether a contact from before the first new one has the key of contact c and nearly the normal n."""
+        found = bool(False)
+        for other in range(first[pack, 0, lane]):
+            if key[pack, other, lane] == key[pack, c, lane]:
+                normal = vec3(
+                    axes[pack, 9 * other, lane], axes[pack, 9 * other + 1, lane], axes[pack, 9 * other + 2, lane]
+                )
+                found = found or wp.dot(normal, n) >= real(TURNED)
+        return found
+
     @wp.kernel(module=module, enable_backward=False)
     def describe(
         # Model
@@ -173,6 +195,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         first_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
+        key_in: wp.array3d(dtype=wp.int32),
         pair_in: wp.array3d(dtype=wp.int32),
         known_in: wp.array3d(dtype=wp.int32),
         known_force_in: wp.array3d(dtype=real),
@@ -189,14 +212,18 @@ def kernels(variant: Variant) -> SimpleNamespace:
         compliance_out: wp.array3d(dtype=real),
         multiplier_out: wp.array3d(dtype=real),
     ):
-        """Axes, gap, law and first guess of every ``parts``-th contact from the first on; neutral past the last one."""
+        """Axes, gap, law and first guess of every ``parts``-th contact from the first on; neutral past the last one.
+
+        A compliant contact that is late, of a feature that pushes along nearly the same normal already, is the same
+        spring once more, as where a ball rolls on to the next face: it becomes a neutral one.
+        """
         pack, item, lane = wp.tid()
         for c in range(first_in[pack, 0, lane] + item, used(pack, lane, count_in, gap_out.shape[1]), parts):
             n = vec3()
             t1 = vec3()
             t2 = vec3()
             force = vec3()
-            gap = real(1.0)
+            gap = real(APART)
             mu = real(0.0)
             restitution = real(0.0)
             compliance = real(0.0)
@@ -215,6 +242,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 if known >= 0:
                     for i in range(3):
                         force[i] = known_force_in[pack, 3 * known + i, lane]
+                if compliance > real(0.0) and is_there(pack, lane, c, n, first_in, key_in, axes_out):
+                    n = vec3()
+                    t1 = vec3()
+                    t2 = vec3()
+                    gap = real(APART)
+                    mu = real(0.0)
+                    restitution = real(0.0)
+                    compliance = real(0.0)
             for i in range(3):
                 axes_out[pack, 9 * c + i, lane] = n[i]
                 axes_out[pack, 9 * c + 3 + i, lane] = t1[i]
@@ -401,6 +436,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         couple_in: wp.array3d(dtype=wp.int32),
         face_in: wp.array3d(dtype=wp.int32),
         touch_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
         # Workspace out
         point_out: wp.array3d(dtype=real),
         dof_out: wp.array3d(dtype=wp.int32),
@@ -412,7 +448,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for c in range(first_in[pack, 0, lane] + item, used(pack, lane, count_in, face_in.shape[1]), parts):
             slot = c * wp.static(SLOTS)
             clear(pack, c, lane, point_out, dof_out, weight_out, lever_out)
-            if c < count_in[pack, 0, lane]:
+            if c < count_in[pack, 0, lane] and gap_in[pack, c, lane] != real(APART):
                 row = c * wp.static(geometry.TOUCH_ROWS)
                 a = touch_vector(touch_in, pack, row + wp.static(POINT_A), lane)
                 b = touch_vector(touch_in, pack, row + wp.static(POINT_B), lane)

@@ -16,6 +16,9 @@ from softwarp.model.codes import Carrier, CoupleColumn
 # Rows of a touch, the geometry of one contact
 NORMAL, POINT_B, POINT_A, DISTANCE, SHARE, BARY, TOUCH_ROWS = 0, 3, 6, 9, 10, 11, 13
 
+TURNED = 0.98  # cosine of the angle from which a normal gets rows of its own
+APART = 1.0  # m, gap of what is no contact
+
 
 @cache
 def structures(scalar: Any) -> SimpleNamespace:

@@ -5,10 +5,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.collision.geometry import DISTANCE, NORMAL, TOUCH_ROWS
+from softwarp.kernels.collision.geometry import APART, DISTANCE, NORMAL, TOUCH_ROWS, TURNED
 from softwarp.model.codes import URGENCIES, CoupleColumn
-
-TURNED = 0.98  # cosine of the angle from which a normal gets rows of its own
 
 
 @single_worlds
@@ -219,13 +217,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         depth: real,
         again: bool,
     ):
-        """Whether the rows of a contact are good enough for where it ends: else they turned, or have failed before."""
+        """Whether the rows of a contact are good enough for where it ends: else they turned, or have failed before.
+
+        One that has been left apart says that others serve.
+        """
         row = wp.static(TOUCH_ROWS) * c
         cosine = real(0.0)
         for k in range(3):
             cosine += touch[pack, row + wp.static(NORMAL) + k, lane] * axes[pack, 9 * c + k, lane]
         is_held = touch[pack, row + wp.static(DISTANCE), lane] - distance >= wp.min(gap, real(0.0)) - depth
-        return is_held or (cosine >= real(TURNED) and not again)
+        return is_held or gap == real(APART) or (cosine >= real(TURNED) and not again)
 
     @wp.kernel(module=module, enable_backward=False)
     def collect_late(
@@ -276,7 +277,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             is_new = False  # served by what was called up, from the side where the step began
                         elif key_out[pack, c, lane] == key and face_out[pack, c, lane] == hit / wp.static(URGENCIES):
                             gap = gap_in[pack, c, lane]
-                            if c >= listed_in[pack, 0, lane]:
+                            if c >= listed_in[pack, 0, lane] and gap != real(APART):
                                 gap = real(0.0)
                             distance = pair_distance_in[pack, pair_out[pack, c, lane], lane]
                             is_new = not is_served(pack, lane, c, touch_in, axes_in, gap, distance, depth, again)

@@ -131,6 +131,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         pose_out[world, row + 3 + c] = q[c]
 
     @wp.kernel(module=module, enable_backward=False)
+    def hold(
+        lanes: int,
+        # Model
+        node_count: int,
+        held_dof: wp.array(dtype=wp.int32),
+        dof_node: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        # State out
+        node_v_out: wp.array2d(dtype=real),
+        twist_out: wp.array2d(dtype=real),
+    ):
+        """Velocity <- 0 along the axes on which one dof is held, as backward Euler leaves it."""
+        pack, item, lane = wp.tid()
+        world = pack * lanes + lane
+        dof = held_dof[item]
+        slot = dof_node[dof]
+        for c in range(3):
+            if dof_free[dof, c] == real(0.0):
+                if slot < node_count:
+                    if world < node_v_out.shape[0]:
+                        node_v_out[world, 3 * slot + c] = real(0.0)
+                elif world < twist_out.shape[0]:
+                    twist_out[world, 3 * (slot - node_count) + c] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
     def predict(
         # Model
         node_count: int,
@@ -306,6 +331,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         choose_integers=choose_integers,
         extrapolate=extrapolate,
         extrapolate_frames=extrapolate_frames,
+        hold=hold,
         predict=predict,
         judge=judge,
         judge_nodes=judge_nodes,

@@ -319,7 +319,7 @@ class Detector:
         c = self.contacts
         self._measure(motion, is_found=is_found)
         parts = self.variant.parts(self.capacity)
-        inputs = [parts, c.first.real, c.count.real, c.pair.real]
+        inputs = [parts, c.first.real, c.count.real, c.key.real, c.pair.real]
         inputs += [self.known.real, self.known_force.real, self.touch.real]
         inputs += [p.real for p in (pairs.distance, pairs.mu, pairs.restitution, pairs.compliance)]
         outputs = [r.real for r in (c.axes, c.gap, c.mu, c.restitution, c.compliance, c.multiplier)]
@@ -328,6 +328,7 @@ class Detector:
         inputs += [self.frame_blend, self.blend_ends, self.blend_place]
         inputs += [self.node_total, self.carrier, self.carrier_weight, parts, motion]
         inputs += [c.first.real, c.count.real, c.key.real, self.couple.real, self.face.real, self.touch.real]
+        inputs += [c.gap.real]
         outputs = [c.point.real, c.dof.real, c.weight.real, c.lever.real]
         self._launch(self.k.slots, parts, inputs, outputs)
 

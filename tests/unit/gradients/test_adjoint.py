@@ -71,7 +71,7 @@ def test_quadratic_elements_and_cables_that_stretch(law: str) -> None:
 @pytest.mark.parametrize("refinement", [0, 2])
 def test_refinement(refinement: int, integrator: str) -> None:
     """Passes of the linear solve, none or two, and as many of its adjoint."""
-    options: dict[str, Any] = {"locked": False, **EXACT} if integrator == "bdf2" else {"elastic": True}
+    options: dict[str, Any] = EXACT if integrator == "bdf2" else {"elastic": True}
     sim = cube("nh_log", refinement=refinement, integrator=integrator, **options)
     check(Rollout(sim), inputs(sim, [1]), weights(sim))
 
@@ -94,7 +94,7 @@ def test_factors_of_quadratic_elements() -> None:
     [
         {},
         pytest.param({"project_tangent": False}, marks=pytest.mark.slow),
-        pytest.param({"integrator": "bdf2", "locked": False}, marks=pytest.mark.slow),
+        pytest.param({"integrator": "bdf2"}, marks=pytest.mark.slow),
         pytest.param({"newton_iterations": 60, "newton_tolerance": 1e-13}, marks=pytest.mark.slow),
     ],
 )
@@ -176,7 +176,7 @@ def test_tangent_of_pressures(blow: float | None, monkeypatch: pytest.MonkeyPatc
     """Pressures at the start of steps are in A; also where a command overrules them, and in stages, rough ones too."""
     sim = cube("nh_log", chamber={}, pressure_tangent=True)
     if blow is not None:
-        sim = cube("nh_log", chamber={}, pressure_tangent=True, integrator="bdf2", locked=False, **EXACT)
+        sim = cube("nh_log", chamber={}, pressure_tangent=True, integrator="bdf2", **EXACT)
         monkeypatch.setitem(CHANGES["state"], "cavity_pressure", 300.0)  # else differences are rounding
     given = inputs(sim, [1])
     given["controls"]["node_force"] += blow or 0.0
@@ -193,9 +193,9 @@ def test_tangent_of_pressures(blow: float | None, monkeypatch: pytest.MonkeyPatc
 def test_steps_of_second_order(law: str, rate: float | None, quadratic: bool) -> None:
     """Two stages, linearised where velocities lead to, with an extrapolation between; cables go part of their way.
 
-    No axis is locked: a velocity along one, which no step leaves behind, counts as 0.
+    The velocity at the start has a part along a locked axis, which counts for nothing.
     """
-    sim = cube(law, integrator="bdf2", quadratic=quadratic, locked=False, **EXACT)
+    sim = cube(law, integrator="bdf2", quadratic=quadratic, **EXACT)
     if rate is not None:
         sim.params.cable_max_rate[...] = rate
     rollout, loss, given = Rollout(sim), weights(sim), inputs(sim, [1])
@@ -209,7 +209,7 @@ def test_steps_of_second_order(law: str, rate: float | None, quadratic: bool) ->
 def test_steps_of_second_order_keep_no_factors() -> None:
     """They are told so."""
     with pytest.raises(ValueError, match="keeps no factors"):
-        Rollout(cube(integrator="bdf2", locked=False))(steps=1, factors=True)
+        Rollout(cube(integrator="bdf2"))(steps=1, factors=True)
 
 
 def _at_the_end(states: States) -> torch.Tensor:

@@ -28,7 +28,7 @@ def solved(sim: sw.Simulation, **options: Any) -> sw.Simulation:
         pytest.param("warped", {"quadratic": True, "chamber": {"control": "gas", "exponent": 1.4}}, marks=SLOW),
         pytest.param("large", {}, marks=SLOW),
         pytest.param("nh_log", {"chamber": {"control": "volume"}}, marks=SLOW),
-        pytest.param("nh_log", {"integrator": "bdf2", "locked": False}, marks=SLOW),
+        pytest.param("nh_log", {"integrator": "bdf2"}, marks=SLOW),
     ],
 )
 def test_soft_bodies(law: str, options: dict[str, Any]) -> None:

@@ -231,6 +231,15 @@ def test_worlds_beside_change_no_bit(options: dict[str, Any]) -> None:
             assert torch.equal(several[world], single[0])
 
 
+@pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
+def test_made_where_nothing_is_followed(without: Callable[[], Any]) -> None:
+    """As where a fit measures its loss alone; cables know how their lengths depend on the rest shape all the same."""
+    sim = scene("large", MESH.nodes)
+    with without():
+        pose = Equilibrium(sim, rest=True)()
+    assert torch.equal(pose.node_x, Equilibrium(sim)().node_x)
+
+
 def test_refusals() -> None:
     """Another shape than the model's, and one that nobody asked for."""
     sim = beam()
