@@ -226,11 +226,15 @@ class StepAdjoint:
         if self.leaning is not None:
             self.leaning.finish(self.node_v, self.node_mass_p, self.p, self.final_v, parameters=parameters)
         if self.contact is not None:
-            self.contact.to_state(self.p)
+            self._contacts_to_state(self.contact)
         if self.modes is not None:
             self.modes.take()
             if self.modes.frames is not None:
                 self.modes.frames.finish()
+
+    def _contacts_to_state(self, contact: ContactAdjoint) -> None:
+        """Gradients by positions, poses and velocities that contacts have."""
+        contact.to_state(self.p)
 
     def _find(self) -> None:
         """p and q of the seed and of the gradients by forces."""
@@ -250,7 +254,7 @@ class StepAdjoint:
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
         if self.modes is not None:
-            self.modes.seed(self.seed, self.system.linear.y)
+            self.modes.seed(self.seed, self.system.linear.y, arrives=first)
         if self.frames is not None:
             self.frames.seed(self.seed, self.system.linear.y, carries=first)
         if self.leaning is not None:
