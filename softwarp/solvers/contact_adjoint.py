@@ -63,7 +63,7 @@ class ContactAdjoint:
 
     forward = False  # whether the equations are those of changes of forces
     knows_way = False  # whether ``way`` has been found from another p
-    ahead: Rows | None = None  # what ``push_nodes`` adds by v: of later contacts, which look where it leads to
+    later: Rows | None = None  # what ``push_nodes`` adds by v: of later contacts, which look where it leads to
 
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
         assert isinstance(system.multipliers, ContactMultipliers)
@@ -132,8 +132,8 @@ class ContactAdjoint:
         c.multiplier.copy_from(self.z)
         self.laws.push(-self.h, by_v)
         c.multiplier.copy_from(self.spare)
-        if self.ahead is not None:
-            self.shard.add(self.ahead, by_v, by_v.real.shape[1])
+        if self.later is not None:
+            self.shard.add(self.later, by_v, by_v.real.shape[1])
 
     def respond(self, y: Rows, p: Rows, q: Rows, gaps: Any, active: Rows, first: bool) -> None:
         """Change of q and z from the half-solved right-hand side, and its effect on that.

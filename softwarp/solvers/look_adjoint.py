@@ -118,7 +118,7 @@ class Looking(StepAdjoint):
         self.v, self.extra = (s.rows(3 * self.model.dof_room) for _ in range(2))
         self.ways = s.rows(3 * self.contacts.capacity)
         turns = self.modes is not None and self.modes.frames is not None
-        self.ahead = s.rows(3 * self.model.dof_room) if turns else None  # on nodes, which turn
+        self.later = s.rows(3 * self.model.dof_room) if turns else None  # on nodes, which turn
         self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
         g = gradients
         self.before = None if self.modes is None else wp.zeros_like(g.node_v)  # what of late contacts goes to modes
@@ -149,19 +149,19 @@ class Looking(StepAdjoint):
         c.multiplier.copy_from(self.ways)
         self.extra.zero()
         self.contact.laws.add_forces(self.extra, self.h)
-        if self.ahead is not None:
-            self.contact.laws.push(self.h, self.ahead)
+        if self.later is not None:
+            self.contact.laws.push(self.h, self.later)
         self._place_first()
         self._seed(first=False)
         s.add(self.extra, self.seed, s.dof_rows)
         for correction in range(1 + self.system.options.refinement):
             self.solve(1 + correction)
         self.to_commands()
-        self.contact.look, self.contact.ahead = self.first.no_look, self.ahead
+        self.contact.look, self.contact.later = self.first.no_look, self.later
         self.comes_first = True
         self.to_start(parameters=parameters)
         self.comes_first = False
-        self.contact.look, self.contact.ahead = self.first.look, None
+        self.contact.look, self.contact.later = self.first.look, None
         for bar, _part, total in self.sums.values():
             s.each_real(k.take_back, bar.shape[1], [s.lanes, total], [bar])
 
@@ -179,11 +179,11 @@ class Looking(StepAdjoint):
         w.dof_v.copy_from(self.first.u)
         self.system.peek(self.h)
         w.dof_v.copy_from(self.v)
-        places = [self.sums[name][1] if name in self.sums else None for name in ("node_x", "frame_pose")]
-        for part in (*places, self.before):
+        x_bar, pose_bar = (self.sums[name][1] if name in self.sums else None for name in ("node_x", "frame_pose"))
+        for part in (x_bar, pose_bar, self.before):
             if part is not None:
                 part.zero_()
-        self.contact.to_end(self.p, *places, self.before)
+        self.contact.to_end(self.p, x_bar, pose_bar, self.before)
         self._return()
 
     def _place_first(self) -> None:

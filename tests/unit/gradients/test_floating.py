@@ -37,6 +37,7 @@ def slab(
     beside: bool = False,
     on: str = "",
     restitution: float = 0.0,
+    tied: bool = False,
     **options: Any,
 ) -> sw.Simulation:
     """The free slab of ``reduction_cases`` with two thirds of its elements.
@@ -50,6 +51,7 @@ def slab(
         beside: Whether a soft body that is not reduced is in the same scene.
         on: What it touches: a "ball", a "floor" that is tilted, a soft "bed"; nothing for "".
         restitution: Of the contact.
+        tied: Whether a cable leads to a point in space.
         **options: Of the simulation.
     """
     builder = scene(held=False, contact=False, law=law, lone=air != "volume")
@@ -60,6 +62,8 @@ def slab(
     weights = np.random.default_rng(0).uniform(0.5, 1.5, len(SLAB.tets))
     weights[::3] = 0.0
     builder.reduce(0, reduced_by(quadratic_modes(), frame="floating", tet_weight=weights))
+    if tied:
+        builder.add_cable(0, [(0.05, 0.01, 0.009), (0.05, 0.02, 0.012)], pull_point=(0.05, 0.0, 0.03), control="force")
     if beside:
         mesh = meshing.box((0.03, 0.02, 0.01), (2, 2, 1))
         other = builder.add_tets(mesh.nodes + 0.1, mesh.tets, material=sw.Corotational(5e4, 0.3), density=900.0)
@@ -100,13 +104,21 @@ SCENES = {
     "under pressure": partial(slab, air="pressure"),
     "beside a soft body, with gas": partial(slab, air="gas", beside=True),
     "on a ball": partial(slab, on="ball"),
+    "tied, on a ball": partial(slab, on="ball", tied=True),
     "on a ball that is looked at once": partial(slab, on="ball", contact_passes=0),
     "on a floor": partial(slab, on="floor"),
     "on a bed": partial(slab, on="bed"),
 }
 LOOKS = {"on a ball": {AT_START, MEASURED}, "on a floor": {AT_START, MEASURED}, "on a bed": {AT_START, MEASURED}}
 SEEDS = {"on a floor": 3, "on a bed": 5}  # in which contacts look at where a step leads to
-SLOW = ["of a projected law", "under pressure", "on a ball that is looked at once", "on a floor", "on a bed"]
+SLOW = [
+    "tied, on a ball",
+    "of a projected law",
+    "under pressure",
+    "on a ball that is looked at once",
+    "on a floor",
+    "on a bed",
+]
 
 
 @pytest.mark.parametrize(
