@@ -88,8 +88,6 @@ class Rollout:
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         rest = checks.flag(rest, "gradients.Rollout: rest")
         require_differentiable(sim)
-        if rest and sim.model.joints is not None:
-            raise ValueError("gradients.Rollout: rest shapes have no gradient beside joints yet; leave rest=True out")
         if rest and _carries_nodes(sim.model):
             told = "rest shapes have no gradient where rods or rigid bodies carry nodes yet"
             raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")

@@ -389,7 +389,7 @@ def _adjoint(
     if steps.control is not None:
         return NewtonAdjoint(steps, gradients, index, rest=rest)
     if steps.system.model.joints is not None:
-        return JointStepAdjoint(steps.system, steps.h, gradients, index)
+        return JointStepAdjoint(steps.system, steps.h, gradients, index, rest=rest)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint
     return kind(steps.system, steps.h, gradients, index, rest=rest)
 

@@ -106,6 +106,9 @@ def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.
         pytest.param("nothing", "trapezoidal", {}, id="trapezoidal"),
         pytest.param("nothing", "trapezoidal", NEWTON, id="trapezoidal, solved", marks=pytest.mark.slow),
         pytest.param("ball", "bdf2", {"contact_passes": 0}, id="contact"),
+        pytest.param("arm", "euler", {"contact_passes": 0}, id="joints"),
+        pytest.param("arm", "bdf2", {"contact_passes": 0}, id="joints, bdf2", marks=pytest.mark.slow),
+        pytest.param("arm", "euler", NEWTON, id="joints, solved", marks=pytest.mark.slow),
         pytest.param("free ball", "euler", {}, id="a free ball, euler"),
         pytest.param("free ball", "bdf2", {"contact_passes": 1}, id="a free ball"),
         pytest.param("free ball", "euler", NEWTON, id="a free ball, solved", marks=pytest.mark.slow),
@@ -133,6 +136,7 @@ def test_beside_other_parts(beside: str, integrator: str, options: dict[str, Any
         ("cable", {}),
         ("ball", {}),
         ("free ball", {}),
+        pytest.param("arm", {"contact_passes": 0}, marks=[SLOW]),
         ("cable", {"integrator": "bdf2"}),
         pytest.param("cable", NEWTON, marks=[SLOW]),
     ],
@@ -198,6 +202,14 @@ def beam_beside(beside: str, newton: bool, rest: np.ndarray, num_worlds: int = 1
         how: dict[str, Any] = {"kinematic": True} if beside == "ball" else {"mass": 0.03, "damping": 0.2}
         ball = builder.add_rigid(sw.Sphere(0.02), pose=(0.09, 0.02, -0.0195), **how)
         builder.add_contact(body, ball, mu=0.4)
+    if beside == "arm":
+        base = builder.add_rigid(sw.Box((0.01, 0.01, 0.01)), mass=0.05, pose=(0.15, 0.02, 0.02))
+        arm = builder.add_rigid(sw.Sphere(0.015), mass=0.03, damping=0.2, pose=(0.09, 0.02, -0.0145))
+        builder.add_joint(None, base, "hinge", axis=(0.0, 1.0, 0.0))
+        builder.add_joint(
+            base, arm, "hinge", axis=(0.0, 1.0, 0.0), anchor=(0.13, 0.02, 0.0), control="position", stiffness=0.2
+        )
+        builder.add_contact(body, arm, mu=0.4)
     if beside == "free ball":
         rod = builder.add_rod([[0.2, 0.0, 0.0], [0.25, 0.0, 0.0]], radius=0.01, youngs=1e6, density=1e3)
         link = builder.add_rigid(sw.Box((0.02, 0.02, 0.02)), mass=0.02, pose=(0.26, 0.0, 0.0))
@@ -243,7 +255,5 @@ def test_refusals() -> None:
         Rollout(cube(covered=True), rest=True)
     with pytest.raises(ValueError, match="no gradient where rods or rigid bodies carry nodes yet; leave rest=True out"):
         Rollout(test_every_input.carried(), rest=True)
-    with pytest.raises(ValueError, match="rest shapes have no gradient beside joints yet"):
-        Rollout(test_every_input.jointed(), rest=True)
     with pytest.raises(ValueError, match="equilibria with membrane 'membrane0' have no gradient yet"):
         Equilibrium(cube(covered=True))
