@@ -384,7 +384,6 @@ class EnvSteps:
         by_state = [torch.where(_along(good, gradients[name]), gradients[name], 0.0) for name in self._state]
         return by_state, by_commands
 
-
     def _tell(self, unsure: Tensor) -> None:
         """Warn of the first worlds whose gradients are not unique."""
         self.unsure = self.unsure | unsure
@@ -394,8 +393,8 @@ class EnvSteps:
         found = unsure.nonzero().flatten().tolist()
         warnings.warn(
             f"{type(self.env).__name__}: in world {found[0]} and {len(found) - 1} others contacts that repeat each "
-            "other slipped, as along an edge that lies flat on a face; how they share their load is not unique, and friction "
-            "depends on it: gradients are 0 there, and EnvSteps.unsure names such worlds from now on",
+            "other slipped, as along an edge that lies flat on a face; how they share their load is not unique, and "
+            "friction depends on it: gradients are 0 there, and EnvSteps.unsure names such worlds from now on",
             stacklevel=2,
         )
 
