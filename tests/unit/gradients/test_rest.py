@@ -107,9 +107,9 @@ def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.
         pytest.param("nothing", "trapezoidal", NEWTON, id="trapezoidal, solved", marks=pytest.mark.slow),
         pytest.param("ball", "bdf2", {"contact_passes": 0}, id="contact"),
         pytest.param("box", "euler", {}, id="a box on it"),
-        pytest.param("stem", "euler", {}, id="a rod on it"),
+        pytest.param("stem", "euler", {}, id="a rod on it", marks=pytest.mark.slow),
         pytest.param("finger", "euler", {}, id="links on it"),
-        pytest.param("arm", "euler", {"contact_passes": 0}, id="joints"),
+        pytest.param("arm", "euler", {"contact_passes": 0}, id="joints", marks=pytest.mark.slow),
         pytest.param("arm", "bdf2", {"contact_passes": 0}, id="joints, bdf2", marks=pytest.mark.slow),
         pytest.param("arm", "euler", NEWTON, id="joints, solved", marks=pytest.mark.slow),
         pytest.param("free ball", "euler", {}, id="a free ball, euler"),
@@ -323,7 +323,7 @@ def tumbled(sim: sw.Simulation, leaf: torch.Tensor | None, seed: int = 4) -> tor
 
 
 @pytest.mark.parametrize("base", ["fixed", pytest.param("moved", marks=SLOW)])
-@pytest.mark.parametrize("which", ["tip", "all"])
+@pytest.mark.parametrize("which", [pytest.param("tip", marks=SLOW), "all"])
 def test_what_something_carries(base: str, which: str) -> None:
     """Levers, masses that turn and waypoints on bodies follow the rest shape, by carried nodes alone and by all."""
     change = 2e-7 * np.random.default_rng(6).standard_normal(CARRIED.shape)
