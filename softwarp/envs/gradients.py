@@ -11,11 +11,13 @@
 The environment takes its own steps, captured on CUDA as always; what these started from is kept. The backward pass goes
 through the sub-steps from the last to the first with the adjoint of docs/theory/adjoint.md. What an action commands,
 what is observed and rewarded are the task's own formulas (``DifferentiableTask``), differentiated by torch. A world
-whose episode ends starts from constants: no gradient passes a reset. Worlds that failed have gradient 0.
+whose episode ends starts from constants: no gradient passes a reset. Worlds that failed have gradient 0; so have those
+in which contacts that repeat each other slipped, whose forces are not unique, and a warning tells of the first ones.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -203,6 +205,9 @@ class EnvSteps:
         factors: Keep the factor of every sub-step for the backward pass instead of finding it again; None: where
             those of a window fit into a quarter of the device's memory.
 
+    Attributes:
+        unsure: Worlds in which a gradient of the last backward pass was not unique and is 0, bool, (world,).
+
     Raises:
         ValueError: If a task, a scene or an option has no gradient; the message names it and the way out.
         MemoryError: If as many worlds again do not fit on the device.
@@ -213,6 +218,7 @@ class EnvSteps:
         self.env = env
         self.worlds = DifferentiableWorlds(env.sim)
         self.maps = _Maps(env)
+        self.unsure, self._has_warned = torch.zeros_like(self.worlds.failed), False
         needed = self.worlds.solution_bytes * env.action_repeat * window
         self.factors = needed <= ROOM * free_bytes(env.device) if factors is None else factors
         self.real = env.sim.node_x.dtype
@@ -233,6 +239,7 @@ class EnvSteps:
         """Let the present be a constant; what is observed now, (world, k)."""
         env = self.env
         self.worlds.start()
+        self.unsure = torch.zeros_like(self.unsure)
         self.now = {name: view.clone() for name, view in self._state.items()}
         self.seen = Points(self.maps, self.now)
         self.held = self._present_held()
@@ -360,6 +367,7 @@ class EnvSteps:
         keys = [key for key in record if key.startswith("solution ")]
         room = [record.pop(key) for key in keys] or None  # a second backward pass finds them again
         by_commands = [torch.zeros_like(value) for value in commands]
+        worlds.forget()
         for substep in reversed(range(self.env.action_repeat)):
             worlds.place({name: record[f"start {name}"][substep] for name in self._started})
             for name, values in zip(names, commands, strict=True):
@@ -369,8 +377,26 @@ class EnvSteps:
                 found[substep].copy_(torch.where(_along(good, found[substep]), gradients[f"command_{name}"], 0.0))
         if room is not None and good.device.type == "cpu":
             self._spare.append(room)
+        unsure = good & (worlds.unsure | worlds.adrift)
+        good = good & ~unsure
+        self._tell(unsure)
+        by_commands = [torch.where(good[:, None], found.flatten(2), 0.0).reshape(found.shape) for found in by_commands]
         by_state = [torch.where(_along(good, gradients[name]), gradients[name], 0.0) for name in self._state]
         return by_state, by_commands
+
+    def _tell(self, unsure: Tensor) -> None:
+        """Warn of the first worlds whose gradients are not unique."""
+        self.unsure = self.unsure | unsure
+        if self._has_warned or not bool(unsure.any()):
+            return
+        self._has_warned = True
+        found = unsure.nonzero().flatten().tolist()
+        warnings.warn(
+            f"{type(self.env).__name__}: in world {found[0]} and {len(found) - 1} others contacts that repeat each "
+            "other slipped, as along an edge that lies flat on a face; how they share their load is not unique, and "
+            "friction depends on it: gradients are 0 there, and EnvSteps.unsure names such worlds from now on",
+            stacklevel=2,
+        )
 
 
 class _Substeps(torch.autograd.Function):

@@ -154,9 +154,6 @@ def _reduced(sim: Simulation) -> Iterator[str]:
     model, told = sim.model, "reduced bodies have no gradient"
     if model.reduction is None:
         return
-    if model.reduction.floating is not None and model.contact is not None and sim.options.contact_passes > 0:
-        way = "take contact_passes=0, or train the reduction with frame='fixed'"
-        yield f"{told} in a floating frame beside contact that is measured anew yet; {way}"
     if model.reduction.floating is not None and model.has_moving_frames:
         parts = "rods, and rigid bodies that move or carry something"
         yield f"{told} in a floating frame beside {parts}, yet; train the reduction with frame='fixed'"

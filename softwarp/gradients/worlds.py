@@ -255,8 +255,7 @@ class DifferentiableWorlds:
             self.parameters[name].copy_(value)
         self.failed.zero_()
         self.unfinished.zero_()
-        for _, told in (*self._adrift, *self._unsure):
-            told.zero_()
+        self.forget()
         self.lagging.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
@@ -325,6 +324,11 @@ class DifferentiableWorlds:
         """Worlds where contacts that slipped repeated each other since ``start``, bool, (world,)."""
         return self._told(self._unsure)
 
+    def forget(self) -> None:
+        """Neither ``adrift`` nor ``unsure`` has any world from now on."""
+        for _, told in (*self._adrift, *self._unsure):
+            told.zero_()
+
     def _told(self, held: list[tuple[tuple[int, int], torch.Tensor]]) -> torch.Tensor:
         found = self.failed.new_zeros(self.failed.shape)
         for (begin, end), told in held:
@@ -389,7 +393,7 @@ def _adjoint(
     if steps.control is not None:
         return NewtonAdjoint(steps, gradients, index, rest=rest)
     if steps.system.model.joints is not None:
-        return JointStepAdjoint(steps.system, steps.h, gradients, index)
+        return JointStepAdjoint(steps.system, steps.h, gradients, index, rest=rest)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint
     return kind(steps.system, steps.h, gradients, index, rest=rest)
 

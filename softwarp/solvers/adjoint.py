@@ -106,6 +106,7 @@ class StepAdjoint:
         self.active = allocate(s.variant, s.world_count, rows, s.device, wp.int32)
         self.none = s.rows(rows)
         self.rest = s.rows(12 * m.tet_count) if rest else None
+        self.no_volume = s.rows(m.node_count if rest else 0)
         self.frames: FrameAdjoint | None = None
         self.leaning: Leaning | None = None
         felt: LeaningFrames | None = None
@@ -226,11 +227,15 @@ class StepAdjoint:
         if self.leaning is not None:
             self.leaning.finish(self.node_v, self.node_mass_p, self.p, self.final_v, parameters=parameters)
         if self.contact is not None:
-            self.contact.to_state(self.p)
+            self._contacts_to_state(self.contact)
         if self.modes is not None:
             self.modes.take()
             if self.modes.frames is not None:
                 self.modes.frames.finish()
+
+    def _contacts_to_state(self, contact: ContactAdjoint) -> None:
+        """Gradients by positions, poses and velocities that contacts have."""
+        contact.to_state(self.p)
 
     def _find(self) -> None:
         """p and q of the seed and of the gradients by forces."""
@@ -250,7 +255,7 @@ class StepAdjoint:
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
         if self.modes is not None:
-            self.modes.seed(self.seed, self.system.linear.y)
+            self.modes.seed(self.seed, self.system.linear.y, arrives=first)
         if self.frames is not None:
             self.frames.seed(self.seed, self.system.linear.y, carries=first)
         if self.leaning is not None:
@@ -504,9 +509,12 @@ class StepAdjoint:
     def _to_rest(self, rest: Rows) -> None:
         """Gradients by the rest shape; needs those by the corners of elements."""
         s, m = self.shard, self.model
+        if self.frames is not None:
+            self.frames.to_rest(self.p, self.node_v, self.node_p)
         if self.tets is not None:
-            felt = (self.node_v, self.element_v, self.node_p, self.stiffness)
-            self.tets.pull_rest(*felt, self.h, self.corner, rest)
+            volume = self.no_volume if self.frames is None else self.frames.volume
+            felt = (self.node_v, self.element_v, self.node_p, volume)
+            self.tets.pull_rest(felt, self.stiffness, self.h, self.corner, rest)
         inputs = [s.lanes, m.corner_start, m.corner, rest.real]
         s.each_real(self.k.rest_nodes, m.node_count, inputs, [self.gradients.rest_x])
         outputs = [self.gradients.cable_rest_length]

@@ -63,6 +63,7 @@ class ContactAdjoint:
 
     forward = False  # whether the equations are those of changes of forces
     knows_way = False  # whether ``way`` has been found from another p
+    later: Rows | None = None  # what ``push_nodes`` adds by v: of later contacts, which look where it leads to
 
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
         assert isinstance(system.multipliers, ContactMultipliers)
@@ -131,6 +132,8 @@ class ContactAdjoint:
         c.multiplier.copy_from(self.z)
         self.laws.push(-self.h, by_v)
         c.multiplier.copy_from(self.spare)
+        if self.later is not None:
+            self.shard.add(self.later, by_v, by_v.real.shape[1])
 
     def respond(self, y: Rows, p: Rows, q: Rows, gaps: Any, active: Rows, first: bool) -> None:
         """Change of q and z from the half-solved right-hand side, and its effect on that.
@@ -182,24 +185,26 @@ class ContactAdjoint:
         """
         if not self.knows_way:
             self.find_way(p, self.way)
-        self._to_places(p, self.gradients.node_x, self.gradients.frame_pose, at_end=False)
+        g = self.gradients
+        self._to_places(p, g.node_x, g.frame_pose, g.node_v, at_end=False)
 
-    def to_end(self, p: Rows, x_bar: wp.array | None, pose_bar: wp.array | None) -> None:
+    def to_end(self, p: Rows, x_bar: wp.array | None, pose_bar: wp.array | None, v_bar: wp.array | None = None) -> None:
         """Add those by positions and poses at the end of the first solution's way, where everything is now.
 
         Args:
             p: Adjoint of the velocities of the last solution.
             x_bar: Receives gradients by positions, as ``Gradients.node_x``.
             pose_bar: Likewise, as ``Gradients.frame_pose``.
+            v_bar: Receives those by velocities at the start, if not ``Gradients.node_v``.
         """
         g = self.gradients
         x_bar, pose_bar = (g.node_x if x_bar is None else x_bar), (g.frame_pose if pose_bar is None else pose_bar)
-        self._to_places(p, x_bar, pose_bar, at_end=True)
+        self._to_places(p, x_bar, pose_bar, g.node_v if v_bar is None else v_bar, at_end=True)
 
-    def _to_places(self, p: Rows, x_bar: wp.array, pose_bar: wp.array, *, at_end: bool) -> None:
+    def _to_places(self, p: Rows, x_bar: wp.array, pose_bar: wp.array, v_bar: wp.array, *, at_end: bool) -> None:
         g = self.gradients
         self._find_parts(p, self.normal if at_end else self.contacts.axes, 3 if at_end else 9, at_end=at_end)
-        outputs = [x_bar, g.node_v, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
+        outputs = [x_bar, v_bar, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
         self._gather(p, outputs, at_end=at_end)
 
     def _find_parts(self, p: Rows, normal: Rows, normal_rows: int, *, at_end: bool) -> None:

@@ -104,15 +104,26 @@ class TetAdjoint:
             inputs += [slopes.mu.real, slopes.lam.real, slopes.law.real, slopes.stiffness.real]
             s.each_real(k.tet_constants, chosen.size, [*inputs, *fields, h], [corner.real])
 
-    def pull_rest(self, v: Rows, felt_v: Rows, p: Rows, stiffness: Rows, h: float, corner: Rows, rest: Rows) -> None:
-        """Gradients by the rest positions of corners; those by corners are there. Elements feel ``felt_v``."""
+    def pull_rest(
+        self, felt: tuple[Rows, Rows, Rows, Rows], stiffness: Rows, h: float, corner: Rows, rest: Rows
+    ) -> None:
+        """Gradients by the rest positions of corners; those by corners are there.
+
+        Args:
+            felt: Velocities of nodes, those that elements feel, p, and gradients by volumes beside all these.
+            stiffness: h^2 + h beta of bodies, or what stands for it.
+            h: Step [s].
+            corner: Gradients by corners.
+            rest: Receives them.
+        """
         s, t, w, i = self.shard, self.tets, self.shard.work, self.shard.input
         for law, chosen in t.laws.items():
             kernel = rest_adjoint.kernels(s.variant, law, s.options.project_tangent).tet_rest
             inputs = [chosen, t.node, t.body, t.gradient, t.volume, s.model.body_law_start]
             inputs += [w.body_mu.real, w.body_lam.real, i["law_parameter"].real, stiffness.real]
             inputs += [w.body_mass.real, i["density"].real, i["gravity"].real, t.x.real, i["v0"].real]
-            s.each_real(kernel, chosen.size, [*inputs, v.real, felt_v.real, p.real, corner.real, h], [rest.real])
+            inputs += [*(part.real for part in felt), corner.real, h]
+            s.each_real(kernel, chosen.size, inputs, [rest.real])
 
 
 class QuadraticAdjoint:

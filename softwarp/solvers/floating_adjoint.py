@@ -102,8 +102,12 @@ class FloatingAdjoint:
         self.listed_touch = wp.array(touch, dtype=wp.int32, device=shard.device)
         self.touch_p, self.touch_v = (shard.rows(3 * shard.model.dof_room) for _ in range(2))
 
-    def find_places(self) -> None:
-        """Where all nodes were and are, and how bodies have turned on; needs the solution of the step."""
+    def find_places(self, *, arrives: bool) -> None:
+        """Where all nodes were and are; needs the solution of the step.
+
+        Args:
+            arrives: Whether bodies turn on as at the end of a step, with their momentum, and not as in a look ahead.
+        """
         s, m, r, i, w = self.shard, self.model, self.term.model, self.shard.input, self.shard.work
         start, end, k = self.start, self.end, self.start.frames.k_inertia
         start.q.copy_from(i["mode_q0"])
@@ -115,6 +119,9 @@ class FloatingAdjoint:
         s.each(self.term.k.trial_amplitude, r.count // 3, inputs, [end.q.S, end.v.S])
         end.frame(self.h)
         end.widen()
+        if not arrives:
+            end.place()
+            return
         for wide, target in ((end.wide_q, self.moment), (end.wide_v, self.rate)):
             inputs = [m.moment_first, m.moment_wide, m.moment_stride, m.moments, wide.S]
             s.each(k.moments, int(m.moment_body.size), inputs, [target.S])
@@ -159,6 +166,14 @@ class FloatingAdjoint:
         s.each_real(self.k.turn_back, m.count, inputs, [*outputs, self.q0_bar.real, self.q1_bar.real])
         self._of_moments(self.end_bar, self.q1_bar, g.mode_q)
         self._of_moments(self.rate_bar, self.nothing, g.mode_v)
+
+    def look_back(self) -> None:
+        """Likewise, of what contacts look at where a solution leads to."""
+        s, m, g = self.shard, self.model, self.gradients
+        self.start_bar.zero()
+        self.q0_bar.zero()
+        inputs = [s.lanes, m.first, m.block, self.term.model.mode_dof, m.radius, s.work.dof_v.real, self.h]
+        s.each_real(self.k.trial_back, m.count, inputs, [g.mode_q, g.mode_v, self.turn_bar.real])
 
     def _of_moments(self, moment_bar: Rows, mode_bar: Rows, bar: wp.array) -> None:
         s, m = self.shard, self.model

@@ -9,6 +9,7 @@ import warp as wp
 
 from softwarp.kernels.elements import rod_adjoint
 from softwarp.kernels.frames import adjoint as of_frames
+from softwarp.kernels.frames import lever_adjoint
 from softwarp.kernels.frames import parameter_adjoint as of_parts
 from softwarp.kernels.frames import welded_adjoint as of_welded
 from softwarp.model.codes import Spin
@@ -33,6 +34,8 @@ class FrameAdjoint:
         lifts: Whether frames carry nodes of soft bodies, whose forces at the start of the step count.
         inertial_v: Velocities of dofs that inertia resists, where joints make these others than those that move things.
         end_v: Velocities that frames move on with after the step, likewise.
+        offset: Gradients by where carried slots are in their frames.
+        volume: Gradients by the volumes of nodes, per density, beside those that elements count.
         more_share: Gradients by what compounds are made of that the state behind the step has.
         pose, force_pose: Poses at which what they carry moves with them, and at which forces act on those.
         twist0: Twists whose momentum they have at the start.
@@ -44,6 +47,7 @@ class FrameAdjoint:
         self.model, self.h, self.gradients = model, h, gradients
         self.k, self.k_segment = of_frames.kernels(shard.variant), rod_adjoint.kernels(shard.variant)
         self.k_part, self.k_welded = of_parts.kernels(shard.variant), of_welded.kernels(shard.variant)
+        self.k_lever = lever_adjoint.kernels(shard.variant)
         self.count = len(model.segment_frames)
         self.attachments = next(term for term in system.terms if isinstance(term, AttachmentTerm))
         self.inertial_v = self.end_v = shard.work.dof_v
@@ -63,6 +67,8 @@ class FrameAdjoint:
         slots, nodes = model.carried_slot.numpy(), shard.model.node_count
         self.lifts = bool((slots < shard.model.body_node_count).any())
         self.impulse, self.stiff = (shard.rows(3 * max(nodes, 1)) for _ in range(2))
+        self.offset, self.volume = shard.rows(3 * max(model.carried_count, 1)), shard.rows(max(nodes, 1))
+        self.rest_pose = wp.array(model.rest_pose, dtype=shard.variant.real, device=shard.device)
         self.item_start, self.item = lists(model.carried_frame.numpy(), model.count, shard.device)
         self.segment_start, self.segment = lists(model.seg_rod.numpy(), model.rod_count, shard.device)
         held = np.zeros(model.count)
@@ -119,7 +125,7 @@ class FrameAdjoint:
         inputs += [m.carried_slot, m.carried_offset, s.model.dof_free, g.node_x, g.node_v, g.frame_pose]
         inputs += [g.frame_twist, s.input["pose0"].real, w.compound.real, w.dof_v.real, self.end_v.real]
         outputs = [seed.real, y.real, self.kept.real, self.start.real, self.moved.real, self.bare.real]
-        outputs.append(self.share.real)
+        outputs += [self.share.real, self.offset.real]
         s.each_real(self.k.frame_seed, m.count, inputs, outputs)
 
     def carry(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
@@ -159,7 +165,7 @@ class FrameAdjoint:
         inputs += [m.carried_slot, m.carried_frame, m.carried_offset]
         inputs += [m.frame_dof, index.node_point_start, index.node_point, index.node_point_weight, index.point_row]
         inputs += [s.input["pose0"].real, w.dof_v.real, p.real, w.point_gradient.real, w.multiplier.real, q.real]
-        outputs = [g.node_x, g.node_v, g.command_node_force, self.items.real]
+        outputs = [g.node_x, g.node_v, g.command_node_force, self.items.real, self.offset.real]
         inputs += [node_bar.real, self.impulse.real, self.stiff.real]
         s.each_real(self.k.carried_gradients, m.carried_count, inputs, outputs)
 
@@ -203,6 +209,26 @@ class FrameAdjoint:
         inputs += [i["pose0"].real, self.force_pose.real, self.twist0.real]
         inputs += [self.inertial_v.real, p.real, self.end_v.real, self.moved.real, self.share.real]
         s.each_real(self.k_part.sources, self.source_frame.size, inputs, [self.value.real])
+
+    def to_rest(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
+        """Add the gradients by the rest positions of carried nodes; ``volume`` receives those by their volumes.
+
+        Args:
+            p: Adjoint of the velocities of dofs.
+            node_v: Velocities of nodes.
+            node_p: Adjoint of these.
+        """
+        s, m, i, w = self.shard, self.model, self.shard.input, self.shard.work
+        motion = self.k_lever.Motion()
+        parts = i["pose0"], self.twist0, self.inertial_v, p, self.end_v, self.moved, self.share
+        for name, part in zip(("pose0", "twist0", "v", "p", "end_v", "moved", "share"), parts, strict=True):
+            setattr(motion, name, part.real)
+        inputs = [self.source_frame, m.source, m.source_lever, s.model.node_volume, s.model.node_body, m.frame_dof]
+        inputs += [i["density"].real, w.body_mass.real, motion, i["v0"].real, node_v.real, node_p.real]
+        s.each_real(self.k_lever.levers, self.source_frame.size, inputs, [self.offset.real, self.volume.real])
+        inputs = [s.lanes, s.model.node_count, m.carried_slot, m.carried_frame, self.rest_pose]
+        outputs = [self.gradients.rest_x, self.offset.real]
+        s.each_real(self.k_lever.rest_carried, m.carried_count, inputs, outputs)
 
     def to_parameters(self, p: Rows) -> None:
         """Add the gradients by parameters and gravity; needs ``to_state``."""

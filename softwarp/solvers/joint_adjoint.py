@@ -37,12 +37,20 @@ class JointStepAdjoint(StepAdjoint):
         gradients: Arrays of these worlds.
         index: Of the model.
         pace: What it does of the commands, where it is a stage of a longer step.
+        rest: Whether gradients by the rest shape are asked for.
     """
 
     def __init__(
-        self, system: System, h: float, gradients: Gradients, index: AdjointIndex, pace: Pace | None = None
+        self,
+        system: System,
+        h: float,
+        gradients: Gradients,
+        index: AdjointIndex,
+        pace: Pace | None = None,
+        *,
+        rest: bool = False,
     ) -> None:
-        super().__init__(system, h, gradients, index)
+        super().__init__(system, h, gradients, index, rest=rest)
         if pace is not None:
             self.pace, self.lapse = pace, pace.lapse
         assert self.frames is not None

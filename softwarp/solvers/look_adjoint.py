@@ -13,9 +13,10 @@ import warp as wp
 
 from softwarp.kernels.rows import look_adjoint
 from softwarp.model import memory
-from softwarp.model.gradients import FRAMES, MEMORIES, MODES, STATE, Gradients
+from softwarp.model.gradients import FLOATING, FRAMES, MEMORIES, MODES, STATE, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
+from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.second_order import PredictedEuler
 from softwarp.solvers.stage_adjoint import StageAdjoint
 from softwarp.solvers.system import System
@@ -116,9 +117,14 @@ class Looking(StepAdjoint):
         self.k_look, self.contacts = self.first.k, self.contact.contacts
         self.v, self.extra = (s.rows(3 * self.model.dof_room) for _ in range(2))
         self.ways = s.rows(3 * self.contacts.capacity)
+        turns = self.modes is not None and self.modes.frames is not None
+        self.later = s.rows(3 * self.model.dof_room) if turns else None  # on nodes, which turn
         self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
         g = gradients
-        names = [*STATE, *FRAMES, *MEMORIES, *MODES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
+        self.before = None if self.modes is None else wp.zeros_like(g.node_v)  # what of late contacts goes to modes
+        self.comes_first = False  # whether the first solution is differentiated
+        names = [*STATE, *FRAMES, *MEMORIES, *MODES, *FLOATING]
+        names += [f.name for f in fields(g) if f.name.startswith("command_")]
         parts = [(name, getattr(g, name)) for name in names]
         self.sums = {
             name: (part, *(wp.zeros(part.shape, dtype=part.dtype, device=s.device) for _ in range(2)))
@@ -143,17 +149,27 @@ class Looking(StepAdjoint):
         c.multiplier.copy_from(self.ways)
         self.extra.zero()
         self.contact.laws.add_forces(self.extra, self.h)
+        if self.later is not None:
+            self.contact.laws.push(self.h, self.later)
         self._place_first()
         self._seed(first=False)
         s.add(self.extra, self.seed, s.dof_rows)
         for correction in range(1 + self.system.options.refinement):
             self.solve(1 + correction)
         self.to_commands()
-        self.contact.look = self.first.no_look
+        self.contact.look, self.contact.later = self.first.no_look, self.later
+        self.comes_first = True
         self.to_start(parameters=parameters)
-        self.contact.look = self.first.look
+        self.comes_first = False
+        self.contact.look, self.contact.later = self.first.look, None
         for bar, _part, total in self.sums.values():
             s.each_real(k.take_back, bar.shape[1], [s.lanes, total], [bar])
+
+    def _contacts_to_state(self, contact: ContactAdjoint) -> None:
+        super()._contacts_to_state(contact)
+        if self.comes_first and self.before is not None:
+            bar = self.gradients.node_v
+            self.shard.each_real(self.k_look.take_back, bar.shape[1], [self.shard.lanes, self.before], [bar])
 
     def _look_back(self) -> None:
         """Gradients by where everything is at the end of the first solution's way."""
@@ -163,11 +179,11 @@ class Looking(StepAdjoint):
         w.dof_v.copy_from(self.first.u)
         self.system.peek(self.h)
         w.dof_v.copy_from(self.v)
-        places = [self.sums[name][1] if name in self.sums else None for name in ("node_x", "frame_pose")]
-        for part in places:
+        x_bar, pose_bar = (self.sums[name][1] if name in self.sums else None for name in ("node_x", "frame_pose"))
+        for part in (x_bar, pose_bar, self.before):
             if part is not None:
                 part.zero_()
-        self.contact.to_end(self.p, *places)
+        self.contact.to_end(self.p, x_bar, pose_bar, self.before)
         self._return()
 
     def _place_first(self) -> None:

@@ -60,13 +60,21 @@ class ModeAdjoint:
             self.frames.rigid_bars(self.wide, by_velocities=listed is self.listed_v)
         s.each_real(self.k.add_modes, m.count, [s.lanes, m.mode_wide, self.wide.real], [by_modes])
 
-    def seed(self, seed: Rows, y: Rows) -> None:
-        """Right-hand sides of p, from gradients by the end of a step; those by nodes are taken over first."""
+    def seed(self, seed: Rows, y: Rows, *, arrives: bool) -> None:
+        """Right-hand sides of p, from gradients by the end of a step; those by nodes are taken over first.
+
+        Args:
+            seed: Receives them.
+            y: Likewise.
+            arrives: Whether that is the end, and not where a look ahead has been.
+        """
         if self.frames is not None:
-            self.frames.find_places()
+            self.frames.find_places(arrives=arrives)
         self.take(at_end=True)
-        if self.frames is not None:
+        if self.frames is not None and arrives:
             self.frames.turn_back()
+        elif self.frames is not None:
+            self.frames.look_back()
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.mode_dof, g.mode_q, g.mode_v]
         s.each_real(self.k.seed, m.count // 3, inputs, [seed.real, y.real])

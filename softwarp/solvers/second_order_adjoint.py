@@ -76,7 +76,7 @@ class SecondOrderAdjoint:
             what = (step.system, step.h, step.pace, step.predict, self.gradients, index, step.judge, self._heed)
             return StageAdjoint(*what, rest=self.rest)
         if step.control is None:  # beside joints, at the start
-            return JointStepAdjoint(step.system, step.h, self.gradients, index, step.pace)
+            return JointStepAdjoint(step.system, step.h, self.gradients, index, step.pace, rest=self.rest)
         return NewtonAdjoint(step, self.gradients, index, rest=self.rest)
 
     def _heed(self, target: Rows) -> None:

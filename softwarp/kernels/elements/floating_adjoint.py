@@ -407,6 +407,36 @@ def kernels(variant: Variant) -> SimpleNamespace:
         put(turn_bar_out, pack, lane, 3 * f, by_turn0)
 
     @wp.kernel(module=module, enable_backward=False)
+    def trial_back(
+        lanes: int,
+        # Model
+        first: wp.array(dtype=wp.int32),
+        block: wp.array(dtype=wp.int32),
+        mode_dof: wp.array(dtype=wp.int32),
+        radius: wp.array(dtype=real),
+        # Workspace in
+        dof_v_in: wp.array3d(dtype=real),
+        x_scale: real,
+        # State out
+        q_bar_out: wp.array2d(dtype=real),
+        v_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        turn_bar_out: wp.array3d(dtype=real),
+    ):
+        """``floating.trial_frame`` of one body backwards: gradients by its turn go to its spin and to its start."""
+        pack, f, lane = wp.tid()
+        world = pack * lanes + lane
+        turn = vector_at(dof_v_in, pack, lane, 3 * mode_dof[block[f] + 1]) * (x_scale / radius[f])
+        by_turn = vector_at(turn_bar_out, pack, lane, 3 * f)
+        by_spin = (x_scale / radius[f]) * (wp.transpose(jacobian(turn)) * by_turn)
+        if world < v_bar_out.shape[0]:
+            for c in range(3):
+                v_bar_out[world, first[f] + 3 + c] = by_spin[c]
+                q_bar_out[world, first[f] + 3 + c] = real(0.0)
+        E = wp.quat_to_matrix(wp.normalize(exponential(turn)))
+        put(turn_bar_out, pack, lane, 3 * f, wp.transpose(E) * by_turn)
+
+    @wp.kernel(module=module, enable_backward=False)
     def moment_bars(
         lanes: int,
         # Model
@@ -482,6 +512,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_bars=node_bars,
         rigid_bars=rigid_bars,
         turn_back=turn_back,
+        trial_back=trial_back,
         moment_bars=moment_bars,
         turn_fields=turn_fields,
     )

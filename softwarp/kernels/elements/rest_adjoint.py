@@ -55,6 +55,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         v0: wp.array3d(dtype=real),
         v: wp.array3d(dtype=real),
         p: wp.array3d(dtype=real),
+        more: wp.array3d(dtype=real),
         pack: int,
         lane: int,
         tet: int,
@@ -62,13 +63,13 @@ def functions(variant: Variant) -> SimpleNamespace:
         scale: real,
         h: real,
     ):
-        """Gradient by the volume of one tet, a quarter of which each of its corners carries."""
+        """Gradient by the volume of one tet, a quarter of which each of its corners carries; ``more`` is of nodes."""
         g = vector_at(gravity, pack, lane, 0)
         total = real(0.0)
         for corner in range(4):
             row = 3 * tet_node[tet, corner]
             change = h * g + vector_at(v0, pack, lane, row) - scale * vector_at(v, pack, lane, row)
-            total += wp.dot(vector_at(p, pack, lane, row), change)
+            total += wp.dot(vector_at(p, pack, lane, row), change) + more[pack, tet_node[tet, corner], lane]
         return real(0.25) * density * total
 
     @wp.func
@@ -163,6 +164,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         node_v_in: wp.array3d(dtype=real),
         felt_v_in: wp.array3d(dtype=real),
         node_p_in: wp.array3d(dtype=real),
+        by_volume_in: wp.array3d(dtype=real),
         corner_in: wp.array3d(dtype=real),
         h: real,
         # Workspace out
@@ -183,7 +185,9 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         k = body_stiffness_in[pack, body, lane]
         density = density_in[pack, body, lane]
         scale = body_mass_in[pack, body, lane]
-        mass = of_mass(tet_node, gravity_in, node_v0_in, node_v_in, node_p_in, pack, lane, tet, density, scale, h)
+        mass = of_mass(
+            tet_node, gravity_in, node_v0_in, node_v_in, node_p_in, by_volume_in, pack, lane, tet, density, scale, h
+        )
         D, b, c = pull(F, p, X, Y, e, g, E, B, mass, tet_volume[tet], h, k)
         b += D * gradient_at(tet_gradient, tet, 0)
         c += D * gradient_at(tet_gradient, tet, 1)

@@ -132,9 +132,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("adjoint.frames")
     one = single.functions(variant)
     vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
-    inertia_at, put, put_quat, exponential = one.inertia_at, one.put, one.put_quat, one.exponential
+    inertia_at, put, add_to, exponential = one.inertia_at, one.put, one.add_to, one.exponential
     compounds = of_compounds(variant)
     turned, momentum = compounds.turned, compounds.momentum
+    put_moved, put_offset = compounds.put_moved, compounds.put_offset
     turns = functions(variant)
     turn_bar, by_turn, jacobian_transposed = turns.turn_bar, turns.by_turn, turns.jacobian_transposed
     of_world, offset_of, carried_bars = turns.of_world, turns.offset_of, turns.carried_bars
@@ -252,10 +253,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         force_bar_out: wp.array2d(dtype=real),
         # Workspace out
         item_out: wp.array3d(dtype=real),
+        offset_out: wp.array3d(dtype=real),
     ):
         """Gradients by place, turn and velocities of its frame that one carried node has, which has none of its own.
 
-        Beside those by its place there is the lever, by which forces of rows and elements do work along p and v.
+        Those by where it is in its frame are added to. Beside those by its place there is the lever, by which forces of
+        rows and elements do work along p and v.
         """
         pack, item, lane = wp.tid()
         world = pack * lanes + lane
@@ -264,7 +267,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             return
         frame = carried_frame[item]
         s = 3 * frame_dof[2 * frame + 1]
-        r = wp.quat_rotate(quat_at(pose0_in, pack, lane, 7 * frame + 3), offset_of(carried_offset, item))
+        q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
+        r = wp.quat_rotate(q, offset_of(carried_offset, item))
         tense = vec3()
         bound = vec3()
         if node < body_node_count:
@@ -277,6 +281,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             bound += q_in[pack, row, lane] * gradient
         place = vector_at(node_bar_in, pack, lane, 3 * node)
         lever = wp.cross(tense, vector_at(p_in, pack, lane, s)) - wp.cross(bound, vector_at(v_in, pack, lane, s))
+        add_to(offset_out, pack, lane, 3 * item, wp.quat_rotate_inv(q, place + lever))
         put(item_out, pack, lane, 12 * item, place)
         put(item_out, pack, lane, 12 * item + 3, wp.cross(r, place + lever))
         put(item_out, pack, lane, 12 * item + 6, -bound)
@@ -323,6 +328,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         moved_out: wp.array3d(dtype=real),
         bare_out: wp.array3d(dtype=real),
         share_out: wp.array3d(dtype=real),
+        offset_out: wp.array3d(dtype=real),
     ):
         """Gradients by the velocities of one frame's dofs, twice, and by its place and turn at the start, but for A.
 
@@ -358,7 +364,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         free_t = vec3(dof_free[t, 0], dof_free[t, 1], dof_free[t, 2])
         free_r = vec3(dof_free[r, 0], dof_free[r, 1], dof_free[r, 2])
         spin = frame_spin[frame]
-        # the way that momentum is carried along; a body that turns alone keeps it about its own origin
+        # the way of momentum; a body that turns alone keeps it about its own origin
         way = wp.where(spin == wp.static(Spin.KEEP_SPIN), vec3(), h * V)
         is_top = spin == wp.static(Spin.FREE_TOP) and m > real(0.0)
         P, L = momentum(m, s, J, Vm, wm)
@@ -397,6 +403,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
             q,
             w1,
         )
+        for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
+            item = frame_item[i]
+            put_offset(offset_out, pack, lane, item, x_bar_in, v_bar_in, world, carried_slot[item], nodes, q, w1)
         by_x += more_x
         by_turn_then += more_t
         by_v += more_v
@@ -417,13 +426,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if keeps:
             ct, cr, rest_v, rest_w = of_momentum_bars(m, s1, J1, q, inertia, by_v, by_w, free_t, free_r)
             by_turn_then -= by_turn(s1, J1, ct, cr, V1, w1)
-            put(moved_out, pack, lane, row, ct)
+            put_moved(moved_out, pack, lane, row, ct, ct - wp.cross(cr, way), cr, V1, w1, q)
             ct -= wp.cross(cr, way)
-            put(moved_out, pack, lane, row + 3, ct)
-            put(moved_out, pack, lane, row + 6, cr)
-            put(moved_out, pack, lane, row + 9, V1)
-            put(moved_out, pack, lane, row + 12, w1)
-            put_quat(moved_out, pack, lane, row + 15, q)
             by_start += by_turn(s, J, ct, cr, Vm, wm)
             by_v, by_w = momentum(m, s, J, ct, cr)
             by_v += rest_v

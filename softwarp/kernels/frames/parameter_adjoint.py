@@ -20,6 +20,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     """Mass matrices of compounds in world axes."""
     one = single.functions(variant)
     real, vec3, mat33, quat = variant.real, one.vec3, one.mat33, one.quat
+    put, put_quat = one.put, one.put_quat
 
     @wp.func
     def turned(q: quat, J: mat33):
@@ -63,7 +64,57 @@ def functions(variant: Variant) -> SimpleNamespace:
         total += J[0, 1] * share[pack, row + 7, lane] + J[0, 2] * share[pack, row + 8, lane]
         return total + J[1, 2] * share[pack, row + 9, lane]
 
-    return SimpleNamespace(turned=turned, momentum=momentum, add_share=add_share, of_share=of_share)
+    @wp.func
+    def put_moved(
+        moved: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        row: int,
+        c: vec3,
+        c0: vec3,
+        cr: vec3,
+        V1: vec3,
+        w1: vec3,
+        q: quat,
+    ):
+        """Write what a frame moves on with, see ``MOVED_ROWS``."""
+        put(moved, pack, lane, row, c)
+        put(moved, pack, lane, row + 3, c0)
+        put(moved, pack, lane, row + 6, cr)
+        put(moved, pack, lane, row + 9, V1)
+        put(moved, pack, lane, row + 12, w1)
+        put_quat(moved, pack, lane, row + 15, q)
+
+    @wp.func
+    def put_offset(
+        offset: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        item: int,
+        x_bar: wp.array2d(dtype=real),
+        v_bar: wp.array2d(dtype=real),
+        world: int,
+        slot: int,
+        nodes: int,
+        q: quat,
+        w: vec3,
+    ):
+        """Write the gradient by where a carried node is in its frame, from those by its place and its velocity."""
+        by_r = vec3()
+        if slot < nodes:
+            row = 3 * slot
+            by_v = vec3(v_bar[world, row], v_bar[world, row + 1], v_bar[world, row + 2])
+            by_r = vec3(x_bar[world, row], x_bar[world, row + 1], x_bar[world, row + 2]) + wp.cross(by_v, w)
+        put(offset, pack, lane, 3 * item, wp.quat_rotate_inv(q, by_r))
+
+    return SimpleNamespace(
+        turned=turned,
+        momentum=momentum,
+        add_share=add_share,
+        of_share=of_share,
+        put_moved=put_moved,
+        put_offset=put_offset,
+    )
 
 
 @single_worlds

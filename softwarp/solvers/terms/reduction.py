@@ -50,6 +50,14 @@ class ReductionTerm(Term):
         self.frames.start_moments()
         self.frames.hold()
 
+    def start_over(self) -> None:
+        """Frames of the start of the step, which rows go by; a look at contacts has turned them on."""
+        w, i = self.shard.work, self.shard.input
+        w.mode_q.copy_from(i["mode_q0"])
+        w.mode_v.copy_from(i["mode_v0"])
+        if self.frames is not None:
+            self.frames.turn(0.0)
+
     def _start(self) -> None:
         """Nodes that a step needs, where somebody moved them or their amplitudes since the last one."""
         s, m, w, state = self.shard, self.model, self.shard.work, self.shard.state

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -155,3 +157,42 @@ def test_steps_that_look_at_contacts_keep_factors() -> None:
         found += torch.autograd.grad(steps.step(action).reward.sum(), action)
     assert found[0].abs().max() > 0.0
     assert torch.equal(found[0], found[1])
+
+
+def test_gradients_that_are_not_unique_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worlds whose contacts repeat each other and slip have gradient 0 from there on back, others keep every bit."""
+    env = sw.make("Diamond", num_worlds=2, seed=0, mesh="coarse")
+    env.reset()
+    start, steps = env.snapshot(), EnvSteps(env)
+    actions = torch.full((STEPS, 2, env.action_size), 0.2)
+
+    def gradient() -> torch.Tensor:
+        env.restore(start)
+        steps.begin()
+        given = actions.clone().requires_grad_()
+        for action in given:
+            steps.step(action)
+        steps.now["node_x"].square().sum().backward()
+        assert given.grad is not None
+        return given.grad
+
+    sure = gradient()
+    assert not steps.unsure.any()
+    flags = torch.zeros(2, dtype=torch.int32)
+    worlds = steps.worlds
+    monkeypatch.setattr(worlds, "_unsure", [((0, 2), flags)])
+    pull = worlds.pull
+
+    def repeats(*arguments: Any, **options: Any) -> None:
+        pull(*arguments, **options)
+        flags[1] = 1
+
+    monkeypatch.setattr(worlds, "pull", repeats)
+    with pytest.warns(UserWarning, match="in world 1 and 0 others contacts that repeat each other slipped"):
+        found = gradient()
+    assert steps.unsure.tolist() == [False, True]
+    assert torch.equal(found[:, 0], sure[:, 0])
+    assert sure[:, 1].any()
+    assert not found[:, 1].any()
+    steps.begin()
+    assert not steps.unsure.any()

@@ -15,14 +15,19 @@ def prove(sim: sw.Simulation, given: Inputs, expected: set[int]) -> None:
     """Gradients are those of differences; contacts of the steps look at what they are to prove."""
     rollout = Rollout(sim)
     check(rollout, given, loss, SIZES)
+    assert looked(rollout, given) >= expected
+
+
+def looked(rollout: Rollout, given: Inputs, constant: tuple[str, ...] = ()) -> set[int]:
+    """What contacts look at in the steps of a rollout, see ``touch_adjoint``; some commands have no axis of steps."""
     found: set[int] = set()
     ((_, system),) = rollout.worlds._twins
     first = system.watch.__self__  # type: ignore[union-attr]
     for steps in range(1, STEPS + 1):
-        controls = {name: value[:steps] for name, value in given["controls"].items()}
-        rollout(given["state"], controls, given["parameters"])
+        controls = {name: value if name in constant else value[:steps] for name, value in given["controls"].items()}
+        rollout(given["state"], controls, given["parameters"], steps=steps)
         found |= set(first.look.real.numpy().ravel().tolist())
-    assert found >= expected
+    return found
 
 
 def turning(given: Inputs, factor: float) -> Inputs:

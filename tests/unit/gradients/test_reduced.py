@@ -13,7 +13,7 @@ from softwarp import meshing
 from softwarp.gradients import Diverged, Equilibrium, Rollout, States
 from tests.cases import FITTED
 from tests.gradient_cases import STEPS, Inputs, gradients
-from tests.reduction_cases import AIR, SLAB, quadratic_modes, reduced_by, scene, smooth_modes
+from tests.reduction_cases import AIR, SLAB, reduced_by, scene, smooth_modes
 from tests.unit.gradients.test_contact import EXACT, SLIPPING, STUCK
 from tests.unit.gradients.test_forward_frames import compare
 from tests.unit.gradients.test_rods import check
@@ -266,7 +266,7 @@ def test_steps_are_those_of_the_simulation() -> None:
 
 
 def test_what_has_no_gradient_is_told() -> None:
-    """By name and with the way out: nodes, other steps, equilibria, rest shapes and floating frames."""
+    """By name and with the way out: nodes, other steps, equilibria and rest shapes."""
     sim = slab()
     with pytest.raises(ValueError, match=r"state .node_x. has no gradient: all nodes follow.*give mode_q"):
         Rollout(sim)({"node_x": sim.node_x}, steps=1)
@@ -278,10 +278,6 @@ def test_what_has_no_gradient_is_told() -> None:
         Equilibrium(sim)
     with pytest.raises(ValueError, match="rest shapes have no gradient beside reduced bodies"):
         Rollout(sim, rest=True)
-    builder = scene(held=False, contact=True)
-    builder.reduce(0, reduced_by(quadratic_modes(), frame="floating"))
-    with pytest.raises(ValueError, match="floating frame beside contact that is measured anew yet; take"):
-        Rollout(sw.Simulation(builder.finalize(num_worlds=1), dt=0.01))
 
 
 def test_friction_that_is_not_unique_is_told() -> None:

@@ -106,6 +106,12 @@ def test_gradients_are_those_of_differences(law: str, loss: Callable[..., torch.
         pytest.param("nothing", "trapezoidal", {}, id="trapezoidal"),
         pytest.param("nothing", "trapezoidal", NEWTON, id="trapezoidal, solved", marks=pytest.mark.slow),
         pytest.param("ball", "bdf2", {"contact_passes": 0}, id="contact"),
+        pytest.param("box", "euler", {}, id="a box on it"),
+        pytest.param("stem", "euler", {}, id="a rod on it", marks=pytest.mark.slow),
+        pytest.param("finger", "euler", {}, id="links on it"),
+        pytest.param("arm", "euler", {"contact_passes": 0}, id="joints", marks=pytest.mark.slow),
+        pytest.param("arm", "bdf2", {"contact_passes": 0}, id="joints, bdf2", marks=pytest.mark.slow),
+        pytest.param("arm", "euler", NEWTON, id="joints, solved", marks=pytest.mark.slow),
         pytest.param("free ball", "euler", {}, id="a free ball, euler"),
         pytest.param("free ball", "bdf2", {"contact_passes": 1}, id="a free ball"),
         pytest.param("free ball", "euler", NEWTON, id="a free ball, solved", marks=pytest.mark.slow),
@@ -133,6 +139,8 @@ def test_beside_other_parts(beside: str, integrator: str, options: dict[str, Any
         ("cable", {}),
         ("ball", {}),
         ("free ball", {}),
+        pytest.param("arm", {"contact_passes": 0}, marks=[SLOW]),
+        ("box", {}),
         ("cable", {"integrator": "bdf2"}),
         pytest.param("cable", NEWTON, marks=[SLOW]),
     ],
@@ -198,6 +206,24 @@ def beam_beside(beside: str, newton: bool, rest: np.ndarray, num_worlds: int = 1
         how: dict[str, Any] = {"kinematic": True} if beside == "ball" else {"mass": 0.03, "damping": 0.2}
         ball = builder.add_rigid(sw.Sphere(0.02), pose=(0.09, 0.02, -0.0195), **how)
         builder.add_contact(body, ball, mu=0.4)
+    if beside in ("box", "stem", "finger"):
+        box = builder.add_rigid(sw.Box((0.02, 0.06, 0.05)), mass=0.03, pose=(0.11, 0.02, 0.02, 0.0, 0.6, 0.0, 0.8))
+        tip = np.flatnonzero(MESH.nodes[:, 0] > 0.0999)
+        builder.attach(body, nodes=tip, to=box)
+        if beside == "stem":
+            rod = builder.add_rod([[0.11, 0.02, 0.02], [0.14, 0.02, 0.02], [0.17, 0.02, 0.03]], radius=0.01, youngs=1e6)
+            builder.attach(box, to=rod, node=0)
+        if beside == "finger":
+            lower = builder.add_rigid(sw.Box((0.03, 0.03, 0.03)), mass=0.02, pose=(0.14, 0.02, 0.02))
+            builder.add_joint(box, lower, "hinge", axis=(0.0, 1.0, 0.2), control="position", stiffness=0.2)
+    if beside == "arm":
+        base = builder.add_rigid(sw.Box((0.01, 0.01, 0.01)), mass=0.05, pose=(0.15, 0.02, 0.02))
+        arm = builder.add_rigid(sw.Sphere(0.015), mass=0.03, damping=0.2, pose=(0.09, 0.02, -0.0145))
+        builder.add_joint(None, base, "hinge", axis=(0.0, 1.0, 0.0))
+        builder.add_joint(
+            base, arm, "hinge", axis=(0.0, 1.0, 0.0), anchor=(0.13, 0.02, 0.0), control="position", stiffness=0.2
+        )
+        builder.add_contact(body, arm, mu=0.4)
     if beside == "free ball":
         rod = builder.add_rod([[0.2, 0.0, 0.0], [0.25, 0.0, 0.0]], radius=0.01, youngs=1e6, density=1e3)
         link = builder.add_rigid(sw.Box((0.02, 0.02, 0.02)), mass=0.02, pose=(0.26, 0.0, 0.0))
@@ -250,9 +276,83 @@ def test_refusals() -> None:
         Equilibrium(sim)(parameters={"rest_x": shape})
     with pytest.raises(ValueError, match="membrane 'membrane0' has no gradient by the rest shape yet"):
         Rollout(cube(covered=True), rest=True)
-    with pytest.raises(ValueError, match="no gradient where rods or rigid bodies carry nodes yet; leave rest=True out"):
-        Rollout(test_every_input.carried(), rest=True)
-    with pytest.raises(ValueError, match="rest shapes have no gradient beside joints yet"):
-        Rollout(test_every_input.jointed(), rest=True)
+    with pytest.raises(ValueError, match="carry nodes beside integrator 'bdf2' yet; leave rest=True out"):
+        Rollout(test_every_input.carried(integrator="bdf2"), rest=True)
+    with pytest.raises(ValueError, match="carry nodes beside Maxwell branches yet"):
+        Rollout(test_every_input.carried(relaxes=True), rest=True)
+    with pytest.raises(ValueError, match="carry nodes beside contact yet"):
+        Rollout(test_every_input.touching("kinematic"), rest=True)
     with pytest.raises(ValueError, match="equilibria with membrane 'membrane0' have no gradient yet"):
         Equilibrium(cube(covered=True))
+
+
+def carried(rest: np.ndarray, base: str, num_worlds: int = 1) -> sw.Simulation:
+    """The beam on a base that moves, with a box at its end that a cable pulls at, whose waypoint is the last node.
+
+    Args:
+        rest: Rest positions, the waypoint's last.
+        base: "fixed" nodes, or a "moved" body that carries them.
+        num_worlds: Of the model.
+    """
+    builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
+    mesh, stuff = replace(MESH, nodes=rest[:-1]), material("large", 1e5, 0.4)
+    body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01))
+    root, tip = (np.flatnonzero(MESH.nodes[:, 0] == x) for x in (0.0, 0.1))
+    if base == "moved":
+        held = builder.add_rigid(sw.Box((0.02, 0.04, 0.04)), pose=(-0.01, 0.02, 0.02), kinematic=True)
+        builder.attach(body, nodes=root, to=held)
+    else:
+        builder.fix(body, nodes=root)
+    box = builder.add_rigid(sw.Box((0.02, 0.06, 0.05)), mass=0.03, pose=(0.11, 0.02, 0.02, 0.0, 0.6, 0.0, 0.8))
+    builder.attach(body, nodes=tip, to=box)
+    builder.add_cable([body, body, box], np.vstack([CABLE_SHARES[:2] @ rest[:-1], rest[-1:]]), stiffness=200.0)
+    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), dt=0.01)
+    sim.control.cable_displacement[...] = 0.004
+    if base == "moved":
+        sim.control.body_velocity[:, 0] = torch.tensor([0.1, 0.0, 0.05, 0.3, 0.5, -1.0])
+    return sim
+
+
+CARRIED = np.vstack([REST, [0.12, 0.01, 0.04]])
+
+
+def tumbled(sim: sw.Simulation, leaf: torch.Tensor | None, seed: int = 4) -> torch.Tensor:
+    """A number for every world after three steps in which the box turns fast."""
+    rng, worlds = np.random.default_rng(seed), len(sim.node_x)
+    start = torch.tensor(CARRIED + 3e-4 * rng.standard_normal(CARRIED.shape))
+    state = {"node_x": start.expand(worlds, *CARRIED.shape)}
+    state["node_v"] = 0.05 * torch.tensor(rng.standard_normal((worlds, *CARRIED.shape)))
+    if not sim.model.has_kinematic:
+        state["body_twist"] = torch.tensor([0.3, -0.2, 0.1, 6.0, -4.0, 5.0]).double().expand(worlds, 1, 6)
+    rollout = Rollout(sim, rest=leaf is not None)
+    states = rollout(state, parameters=None if leaf is None else {"rest_x": leaf}, steps=3)
+    weight = torch.tensor(np.random.default_rng(5).standard_normal(CARRIED.shape))
+    found = ((states.node_x + states.node_v) * weight).flatten(2).sum(dim=(0, 2))
+    return found + states.body_twist.flatten(2).sum(dim=(0, 2)) + 0.01 * states.cable_tension.sum(dim=(0, 2))
+
+
+@pytest.mark.parametrize("base", ["fixed", pytest.param("moved", marks=SLOW)])
+@pytest.mark.parametrize("which", [pytest.param("tip", marks=SLOW), "all"])
+def test_what_something_carries(base: str, which: str) -> None:
+    """Levers, masses that turn and waypoints on bodies follow the rest shape, by carried nodes alone and by all."""
+    change = 2e-7 * np.random.default_rng(6).standard_normal(CARRIED.shape)
+    if which == "tip":
+        change[CARRIED[:, 0] < 0.09] = 0.0
+    leaf = torch.tensor(CARRIED).requires_grad_()
+    tumbled(carried(CARRIED, base), leaf).sum().backward()
+    assert leaf.grad is not None
+    derivative = float((leaf.grad * torch.tensor(change)).sum())
+    values = [float(tumbled(carried(CARRIED + way * change, base), None)) for way in (1.0, -1.0, 2.0, -2.0)]
+    expected = (8.0 * (values[0] - values[1]) - (values[2] - values[3])) / 12.0
+    assert abs(derivative - expected) <= 1e-6 * abs(expected)
+
+
+def test_worlds_of_what_something_carries_change_no_bit() -> None:
+    """Three worlds with their own velocities, and the first of them alone."""
+    found = []
+    for count in (3, 1):
+        leaf = torch.tensor(CARRIED).expand(count, *CARRIED.shape).clone().requires_grad_()
+        tumbled(carried(CARRIED, "fixed", count), leaf).sum().backward()
+        assert leaf.grad is not None
+        found.append(leaf.grad[0])
+    assert torch.equal(*found)
