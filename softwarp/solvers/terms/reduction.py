@@ -262,8 +262,10 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.place(count)
 
-    def place_both(self, rest: wp.array, one: Rows, other: Rows, first: Rows, second: Rows) -> None:
-        """Two sums of modes at all listed nodes.
+    def place_both(
+        self, rest: wp.array, one: Rows, other: Rows, first: Rows, second: Rows, count: int | None = None
+    ) -> None:
+        """Two sums of modes at listed nodes.
 
         Args:
             rest: What is added to the first sum, (listed, 3).
@@ -271,8 +273,10 @@ class ReductionTerm(Term):
             other: Likewise.
             first: Receives the sum by nodes of one.
             second: Of the other.
+            count: Of the first nodes of the list; None takes all.
         """
-        s, inputs, count = self.shard, [*self._basis(), rest, one.S, other.S], int(self.model.node.size)
+        s, inputs = self.shard, [*self._basis(), rest, one.S, other.S]
+        count = int(self.model.node.size) if count is None else count
         if self.k_place is not None:
             items = -(-count // mode_places.NODES)
             s.each(self.k_place.node_states, items, [count, *inputs], [first.S, second.S])
