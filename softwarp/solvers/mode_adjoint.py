@@ -93,7 +93,8 @@ class ModeAdjoint:
         Args:
             v: Velocities of dofs.
             p: Adjoint of these.
-            node_v, node_p: Receive those of nodes.
+            node_v: Receives those of nodes.
+            node_p: Likewise.
             everywhere: Whether nodes are asked for that no element or row needs, which have forces alone.
         """
         s, m, t = self.shard, self.model, self.term

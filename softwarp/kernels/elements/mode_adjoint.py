@@ -31,7 +31,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         listed_out: wp.array3d(dtype=real),
     ):
-        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards. On a CPU of all of them."""
+        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards; on a CPU of all."""
         pack, part, lane = wp.tid()
         world = pack * lanes + lane
         first = int(0)

@@ -29,7 +29,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("adjoint.rows")
     one = single.functions(variant)
-    vec3, vector_at, put = one.vec3, one.vector_at, one.put
+    vector_at, put = one.vector_at, one.put
     dependent = DEPENDENT[real]
 
     @wp.kernel(module=module, enable_backward=False)

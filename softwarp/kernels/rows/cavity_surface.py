@@ -163,7 +163,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         point_bar_out: wp.array2d(dtype=S),
     ):
-        """Gradient by the points of one chamber's surface, as ``cavity_adjoint.cavity_points`` has it by their rings."""
+        """Gradient by the points of one chamber's surface; ``cavity_adjoint.cavity_points`` has it by rings."""
         w, cavity = wp.tid()
         along(
             cavity_tri,

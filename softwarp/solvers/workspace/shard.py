@@ -77,7 +77,7 @@ class Shard(Launches):
             self.each_real(self.k_state.interleave, None, inputs, [target.real])
 
     def check_finite(self, values: Rows, count: int) -> None:
-        """Raise the flags of worlds where one of the first rows of ``values`` is not finite; none without ``checks``."""
+        """Raise the flags of worlds where one of the first rows of ``values`` is not finite, if it ``checks``."""
         if not self.checks:
             return
         inputs = [count, values.real]
