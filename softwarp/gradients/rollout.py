@@ -307,7 +307,7 @@ class _Steps(torch.autograd.Function):
                 gradients[name].add_(by[segment])
             for offset in reversed(range(plan.every)):
                 step = segment * plan.every + offset
-                worlds.place(states[offset], is_stepped=step > 0)
+                worlds.place(states[offset])
                 call.command(step)
                 place = step if plan.every == 1 else offset
                 worlds.pull(room, place, parameters=parameters, forces=forces)

@@ -243,13 +243,6 @@ class DifferentiableWorlds:
         self._adrift = [(at, _flags(part.adrift)) for at, part in stages if isinstance(part, NewtonAdjoint)]
         self._unsure = [(at, _flags(part.contact.unsure)) for at, part in stages if part.contact is not None]
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
-        self._good: list[tuple[torch.Tensor, torch.Tensor]] = []  # last good ones of what nodes of modes follow from
-        if model.reduction is not None and not wp.get_device(model.device).is_cuda:
-            state = room.worlds[0]
-            pairs = ((state.node_x, state.good_x), (state.mode_q, state.good_mode_q))
-            self._good = [
-                (wp.to_torch(now, requires_grad=False), wp.to_torch(good, requires_grad=False)) for now, good in pairs
-            ]
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
     def start(self) -> None:
@@ -341,18 +334,10 @@ class DifferentiableWorlds:
             found[begin:end].logical_or_(told[: end - begin] != 0)
         return found
 
-    def place(self, state: dict[str, torch.Tensor], *, is_stepped: bool = False) -> None:
-        """Put positions, velocities, tensions and pressures in place, and the memory of contacts.
-
-        Args:
-            state: These.
-            is_stepped: Whether a step has led there, so that nodes are where modes have them.
-        """
+    def place(self, state: dict[str, torch.Tensor]) -> None:
+        """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
         for name in (*self.names, *self.memory):
             self.state[name].copy_(state[name])
-        if is_stepped:
-            for now, good in self._good:
-                good.copy_(now)
 
     def kept(self) -> dict[str, torch.Tensor]:
         """Copies of these."""

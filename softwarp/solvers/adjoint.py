@@ -39,6 +39,8 @@ def solution_of(system: System) -> list[wp.array]:
     kept = [w.dof_v.real, *system.linear.factors]
     if system.shard.model.row_count:
         kept += [w.row.real, w.multiplier.real]
+    if system.model.reduction is not None and system.model.reduction.floating is not None:
+        kept += [w.wide_drag.real, w.turning_drag.real]
     is_bounded = isinstance(system.multipliers, BoundedMultipliers)
     if is_bounded:
         kept.append(w.delassus.real)
@@ -165,7 +167,7 @@ class StepAdjoint:
                 term.stiffness()
         for term in self.system.terms:
             if isinstance(term, ReductionTerm) and term.frames is not None:
-                term.sample()
+                term.sample(drag=False)  # which the solution has
 
     def _find_forces(self) -> None:
         self.system.forces()
@@ -175,9 +177,9 @@ class StepAdjoint:
     def _load(self, without: tuple[str, ...] = ()) -> None:
         """What a step starts from."""
         system = self.system
-        self.shard.checks = False  # the step has looked at all that it reads
+        self.shard.is_settled = True
         system.load(without=without)
-        self.shard.checks = True
+        self.shard.is_settled = False
         system.scale(self.h)
         system.measure_rows()
         system.command(self.h, self.pace)

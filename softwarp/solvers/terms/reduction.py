@@ -43,10 +43,14 @@ class ReductionTerm(Term):
         for name in ("mode_q0", "mode_v0"):
             s.check_finite(i[name], self.model.count)
         if self.frames is None:
-            self._start()
+            if not s.is_settled:
+                self._start()
             return
         self.frames.start()
-        self._place(self.model.active_count)
+        if s.is_settled:
+            self._widen(w.mode_q, w.wide_q)
+        else:
+            self._place(self.model.active_count)
         self.frames.start_moments()
         self.frames.hold()
 
@@ -82,8 +86,8 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.tangent()
 
-    def sample(self) -> None:
-        """Stiffness of the elements that count."""
+    def sample(self, *, drag: bool = True) -> None:
+        """Stiffness of the elements that count, and in floating frames what damping does where a body turns."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.tet_sample, m.tet_turned, s.model.tet_body, w.body_mu.S, w.body_lam.S, w.body_stiffness.S]
         inputs += [w.tet_gradient.S, w.tet_stiffness.S]
@@ -93,6 +97,8 @@ class ReductionTerm(Term):
             s.each(self.k_sample.tri_stiffness, self.tris, inputs, [w.thin_stiffness.S])
         if self.frames is not None:
             self.frames.turn_stiffness()
+            if drag:
+                self.frames.drag()
 
     def _gather(self) -> None:
         """Their sum on a GPU."""
