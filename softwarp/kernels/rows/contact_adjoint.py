@@ -268,8 +268,6 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         own = delassus[pack, i * order + i, lane]
         return wp.where(own > real(0.0), real(1.0) / wp.sqrt(own), real(1.0))
 
-    factor, eliminate = elimination.functions(real).factor, elimination.functions(real).solve
-
     @wp.kernel(module=module, enable_backward=False)
     def solve(
         rows: int,
@@ -384,6 +382,11 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         for i in range(total, order):
             change_out[pack, i, lane] = real(0.0)
 
+    result = SimpleNamespace(known_gaps=known_gaps, modes=modes, solve=solve)
+    if variant.world_fastest:
+        return result
+    factor, eliminate = elimination.functions(real).factor, elimination.functions(real).solve
+
     @wp.kernel(module=module, enable_backward=False)
     def solve_again(
         rows: int,
@@ -463,4 +466,4 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         for i in range(total, order):
             change_out[pack, i, lane] = real(0.0)
 
-    return SimpleNamespace(known_gaps=known_gaps, modes=modes, solve=solve, solve_again=solve_again)
+    return SimpleNamespace(**vars(result), solve_again=solve_again)
