@@ -49,7 +49,7 @@ class Call:
         model = worlds.model
         is_placed = any(name.startswith(("state.body", "state.rod")) for name in self.tensors)
         leads = model.joints is not None or (model.frames is not None and model.frames.welded_frame.size)
-        if (is_placed and leads) or {"state.mode_q", "state.mode_turn"} & self.tensors.keys():
+        if (is_placed and leads) or model.reduction is not None:  # the way back goes by nodes that modes have placed
             worlds.refresh()
 
     def command(self, step: int) -> None:

@@ -308,6 +308,7 @@ class _Steps(torch.autograd.Function):
         asked = ctx.needs_input_grad[2:]
         wanted = [name for name, is_asked in zip(plan.names, asked, strict=True) if is_asked]
         parameters = any(name.startswith("params.") for name in wanted)
+        forces = any(name in ("control.node_force", "control.traction") for name in wanted)
         room, ctx.room = ctx.room, None  # a second backward pass finds solutions again
         if plan.factors and plan.every > 1:
             room = worlds.solutions(plan.every)
@@ -320,7 +321,8 @@ class _Steps(torch.autograd.Function):
                 step = segment * plan.every + offset
                 worlds.place(states[offset])
                 call.command(step)
-                worlds.pull(room, step if plan.every == 1 else offset, parameters=parameters)
+                place = step if plan.every == 1 else offset
+                worlds.pull(room, place, parameters=parameters, forces=forces)
                 for name, by in by_commands.items():
                     (by[step] if name in plan.moving else by).add_(gradients[f"command_{name}"])
         if room is not None:

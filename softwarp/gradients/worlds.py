@@ -220,8 +220,11 @@ class DifferentiableWorlds:
         self._refresh = Replayed(model.device, [system.refresh for _, system in twins], workers)
         self._pull, self._prepare, self._pull_kept = (
             {
-                parameters: Replayed(model.device, [getattr(pull, of_pull) for pull in pulls], workers)
+                (parameters, forces): Replayed(
+                    model.device, [_launches(pull, of_pull, forces=forces) for pull in pulls], workers
+                )
                 for parameters, of_pull in ((True, name), (False, f"{name}_alone"))
+                for forces in (True, False)
                 if hasattr(pulls[0], of_pull)
             }
             for name in ("step", "prepare", "pull")
@@ -366,21 +369,30 @@ class DifferentiableWorlds:
         for held, part in zip(room, self._solution, strict=True):
             held[place].copy_(part)
 
-    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0, *, parameters: bool = True) -> None:
+    def pull(
+        self,
+        room: list[torch.Tensor] | None = None,
+        place: int = 0,
+        *,
+        parameters: bool = True,
+        forces: bool = True,
+    ) -> None:
         """Gradients by the end of the step from the present state become those by the present state, in place.
 
         Args:
             room: Kept solutions, among them that of this step; without, it is found again.
             place: Where it is.
             parameters: Whether gradients by parameters are asked for, which else stay as they are.
+            forces: Whether those by node forces and tractions are, which else need not be found.
         """
+        key = parameters, forces or self.model.reduction is None  # where it makes no difference
         if room is None:
-            self._pull[parameters]()
+            self._pull[key]()
             return
-        self._prepare[parameters]()
+        self._prepare[key]()
         for held, part in zip(room, self._solution, strict=True):
             part.copy_(held[place])
-        self._pull_kept[parameters]()
+        self._pull_kept[key]()
 
 
 def _adjoint(
@@ -396,6 +408,18 @@ def _adjoint(
         return JointStepAdjoint(steps.system, steps.h, gradients, index, rest=rest)
     kind = LookStepAdjoint if steps.system.multipliers.corrections else StepAdjoint
     return kind(steps.system, steps.h, gradients, index, rest=rest)
+
+
+def _launches(pull: StepAdjoint | SecondOrderAdjoint, name: str, *, forces: bool) -> Callable[[], None]:
+    """A method of an adjoint, with gradients by node forces or without."""
+    method = getattr(pull, name)
+
+    def launch() -> None:
+        if isinstance(pull, StepAdjoint):
+            pull.by_forces = forces
+        method()
+
+    return launch
 
 
 def _flags(array: wp.array) -> torch.Tensor:

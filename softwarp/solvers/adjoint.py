@@ -10,7 +10,7 @@ import warp as wp
 
 from softwarp.kernels.elements import adjoint_sums, traction
 from softwarp.kernels.rows import adjoint as of_rows
-from softwarp.kernels.rows import cavity_adjoint
+from softwarp.kernels.rows import cavity_adjoint, cavity_surface
 from softwarp.model.cavities import CavityModel
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
@@ -39,6 +39,8 @@ def solution_of(system: System) -> list[wp.array]:
     kept = [w.dof_v.real, *system.linear.factors]
     if system.shard.model.row_count:
         kept += [w.row.real, w.multiplier.real]
+    if system.model.reduction is not None and system.model.reduction.floating is not None:
+        kept += [w.wide_drag.real, w.turning_drag.real]
     is_bounded = isinstance(system.multipliers, BoundedMultipliers)
     if is_bounded:
         kept.append(w.delassus.real)
@@ -58,6 +60,7 @@ class StepAdjoint:
         rest: Whether gradients by the rest shape are asked for.
 
     Attributes:
+        by_forces: Whether gradients by node forces and tractions are asked for, of all nodes.
         predicts: Whether it is linearised where its start velocities lead to.
     """
 
@@ -73,6 +76,7 @@ class StepAdjoint:
         self.shard, self.model = s, m
         self.k = adjoint_sums.kernels(s.variant)
         self.k_rows, self.k_chambers = of_rows.kernels(s.variant), cavity_adjoint.kernels(s.variant)
+        self.k_surface = None if s.variant.world_fastest else cavity_surface.kernels(s.variant)
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_room)
         self.node_v, self.node_p, self.node_mass_p = (s.rows(3 * m.node_count) for _ in range(3))
@@ -119,6 +123,10 @@ class StepAdjoint:
             self.leaning = leaning = Leaning(system, h, gradients, index, felt)
             self.element_v, self.row_v = leaning.element_v, leaning.row_v
         self.contact = None if system.contact is None else self.touches(system, h, gradients)
+        self.has_modes_alone = self.modes is not None and m.own_node_count == 0 and self.frames is None
+        if self.modes is not None:
+            self.modes.is_lone = self.has_modes_alone and self.contact is None
+        self.by_forces = True
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
     @property
@@ -160,7 +168,7 @@ class StepAdjoint:
                 term.stiffness()
         for term in self.system.terms:
             if isinstance(term, ReductionTerm) and term.frames is not None:
-                term.sample()
+                term.sample(drag=False)  # which the solution has
 
     def _find_forces(self) -> None:
         self.system.forces()
@@ -170,7 +178,9 @@ class StepAdjoint:
     def _load(self, without: tuple[str, ...] = ()) -> None:
         """What a step starts from."""
         system = self.system
+        self.shard.is_settled = True
         system.load(without=without)
+        self.shard.is_settled = False
         system.scale(self.h)
         system.measure_rows()
         system.command(self.h, self.pace)
@@ -289,7 +299,11 @@ class StepAdjoint:
         rows, count = system.rows, m.row_count
         if correction == 0:
             y.zero()
-            rows.into_sides()
+            if self.has_modes_alone:  # products with dense modes
+                inputs = [m.dof_count, m.entry_dof, m.entry_row, m.dof_free, w.row.S]
+                s.each(self.k.kept_sides, m.entry_start.size - 1 if count else 0, inputs, [y.S])
+            else:
+                rows.into_sides()
             s.add(self.seed, y, s.dof_rows)
         else:
             inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
@@ -404,10 +418,12 @@ class StepAdjoint:
 
     def _to_elements(self, *, parameters: bool = True) -> None:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
-        outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
-        s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+        if not self.has_modes_alone:
+            outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
+            s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
         if self.modes is not None:
-            self.modes.place(w.dof_v, self.p, self.node_v, self.node_p)
+            everywhere = self.by_forces or self.modes.frames is not None
+            self.modes.place(w.dof_v, self.p, self.node_v, self.node_p, everywhere=everywhere)
         if self.frames is not None:
             self.frames.carry(self.p, self.node_v, self.node_p)
         if self.leaning is not None:
@@ -433,8 +449,8 @@ class StepAdjoint:
             self.skin.pull(*elements)
         if not m.row_count:
             return
-        inputs = [h, m.point_node, m.point_weight, self.index.point_row, self.row_v.real, self.node_p.real]
-        s.each_real(self.k_rows.points, len(m.point_node), [*inputs, w.multiplier.real, self.q.real], [self.way.real])
+        inputs = [h, m.point_node, m.point_weight, self.index.point_row, self.row_v.S, self.node_p.S]
+        s.each(self.k.points, len(m.point_node), [*inputs, w.multiplier.S, self.q.S], [self.way.S])
         fields = [w.point_x.real, w.point_gradient.real, self.way.real, self.measured.real]
         inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *fields]
         s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.point.real])
@@ -443,9 +459,14 @@ class StepAdjoint:
 
     def _to_surfaces(self, c: CavityModel, fields: list[wp.array]) -> None:
         """Gradients by the points of chambers."""
-        s, m, g = self.shard, self.model, self.gradients
-        inputs = [m.point_count, m.first_row("cavity"), c.ring_start, c.point_ring, c.point_cavity, c.cavity_area]
-        s.each_real(self.k_chambers.cavity_points, int(c.starts[-1]), [*inputs, *fields], [self.point.real])
+        s, m, w, g = self.shard, self.model, self.shard.work, self.gradients
+        if self.k_surface is not None:
+            inputs = [m.first_row("cavity"), c.cavity_point_start, c.cavity_tri_start, c.cavity_tri, c.cavity_area]
+            inputs += [w.point_x.S, w.point_gradient.S, self.way.S, self.measured.S]
+            s.each(self.k_surface.points_along, m.cavity_count, inputs, [self.point.S])
+        else:
+            inputs = [m.point_count, m.first_row("cavity"), c.ring_start, c.point_ring, c.point_cavity, c.cavity_area]
+            s.each_real(self.k_chambers.cavity_points, int(c.starts[-1]), [*inputs, *fields], [self.point.real])
         if self.surface is not None:
             start_v = self.surface.rest_v if self.leaning is None else self.leaning.start_v
             self.surface.pull(self.p, start_v, self.point, g.cavity_pressure)
@@ -457,6 +478,9 @@ class StepAdjoint:
     def _to_state(self) -> None:
         """Gradients by positions, velocities and forces of nodes."""
         s, m, i, g, x = self.shard, self.model, self.shard.input, self.gradients, self.index
+        if self.modes is not None and self.modes.is_lone:
+            self._to_modes(self.modes)
+            return
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
         s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
         inputs = [self.h, s.lanes, m.node_body, i["density"].real]
@@ -469,6 +493,20 @@ class StepAdjoint:
                     self.contact.push_nodes(self.modes.frames.touch_p, self.modes.frames.touch_v)
                 self.modes.frames.to_state(self.index, self.p, self.q, self.corner)
         self._to_tractions()
+
+    def _to_modes(self, modes: ModeAdjoint) -> None:
+        """The same where all nodes follow modes, and elements and rows are all that nodes have a part in."""
+        s, m, x = self.shard, self.model, self.index
+        inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
+        modes.sum([*inputs, self.corner.S, self.point.S])
+        modes.to_state()
+        if self.by_forces:
+            parts = s.variant.parts(3 * m.node_count)
+            inputs = [self.h, s.lanes, self.node_p.real]
+            s.each_real(self.k.node_forces, parts, inputs, [self.gradients.command_node_force])
+            self._to_tractions()
+        if modes.frames is not None:
+            modes.frames.to_state(self.index, self.p, self.q, self.corner)
 
     def _to_tractions(self) -> None:
         s, m, g = self.shard, self.model, self.gradients

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.rows import contact_adjoint, embedded_adjoint, touch_adjoint, touch_gather
+from softwarp.kernels.rows import contact_adjoint, elimination, embedded_adjoint, touch_adjoint, touch_gather
 from softwarp.model import memory
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.collision.detector import Detector
@@ -78,7 +78,13 @@ class ContactAdjoint:
         self.detector = system.contact.detector
         self.unsure = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self._prepare_touches()
-        self.matrix = rows.allocate_whole(s.variant, s.world_count, self.laws.order**2, s.device)
+        order, worlds = self.laws.order, s.packs * s.lanes
+        if s.variant.world_fastest:
+            self.matrix = rows.allocate_whole(s.variant, s.world_count, order**2, s.device).real
+        else:
+            self.matrix = memory.zeros((worlds, order**2, 1), s.variant.real, s.device)
+            self.held = memory.zeros((worlds, elimination.ROWS * order, 1), s.variant.real, s.device)
+        self.is_new = True  # so that factors of the equations are to be found
 
     def _prepare_touches(self) -> None:
         """Kernels and room for what depends on where everything is."""
@@ -108,6 +114,7 @@ class ContactAdjoint:
             first: Whether it is the first one that is differentiated; sides are there else.
         """
         c, s = self.contacts, self.shard
+        self.is_new = True
         self._expand(v)
         self.z.zero()
         if first:
@@ -148,15 +155,20 @@ class ContactAdjoint:
         """
         laws, c, s, h, w = self.laws, self.contacts, self.shard, self.h, self.shard.work
         if first:
+            self.is_new = True
             laws.delassus(y, h * h, whole=True)
         self._known_gaps(p)
         laws.contact_sides.free_gap(y, h, laws.gap)
         if laws.static_rows:
             gaps(laws.gap)
-        inputs = [laws.static_rows, laws.order, c.count.real, laws.matrix.real, w.compliance.real, c.compliance.real]
+        inputs = [c.count.real, laws.matrix.real, w.compliance.real, c.compliance.real]
         inputs += [active.real, self.mode.real, c.mu.real, laws.gap.real, self.offset.real]
-        outputs = [self.matrix.real, laws.change.real, q.real, self.z.real, self.unsure]
-        s.each_real(self.k.solve, None, inputs, outputs)
+        outputs, sizes = [laws.change.real, q.real, self.z.real, self.unsure], [laws.static_rows, laws.order]
+        if s.variant.world_fastest:
+            s.each_real(self.k.solve, None, [*sizes, *inputs], [self.matrix, *outputs])
+        else:
+            s.each_real(self.k.solve_again, None, [*sizes, self.is_new, *inputs], [self.matrix, self.held, *outputs])
+        self.is_new = False
         laws.add_change(y, -h)
 
     def _expand(self, *velocities: Rows) -> None:
@@ -203,13 +215,14 @@ class ContactAdjoint:
 
     def _to_places(self, p: Rows, x_bar: wp.array, pose_bar: wp.array, v_bar: wp.array, *, at_end: bool) -> None:
         g = self.gradients
-        self._find_parts(p, self.normal if at_end else self.contacts.axes, 3 if at_end else 9, at_end=at_end)
+        moving, normal = self._motion(p), self.normal if at_end else self.contacts.axes
+        self._find_parts(moving, normal, 3 if at_end else 9, at_end=at_end)
         outputs = [x_bar, v_bar, g.pair_mu, pose_bar, g.frame_twist, g.command_body_velocity]
-        self._gather(p, outputs, at_end=at_end)
+        self._gather(moving[0], outputs, at_end=at_end)
 
-    def _find_parts(self, p: Rows, normal: Rows, normal_rows: int, *, at_end: bool) -> None:
+    def _find_parts(self, moving: tuple[Any, Any], normal: Rows, normal_rows: int, *, at_end: bool) -> None:
         c, s, o, d = self.contacts, self.shard, self.system.options, self.detector
-        motion, fields = self._motion(p)
+        motion, fields = moving
         inputs = [self.h, o.recovery_share(self.h), o.recovery_speed, o.bounce_speed, d.node_total]
         inputs += [at_end, normal_rows, d.scene, self.top, motion, fields, self.look.real, normal.real]
         inputs += [c.count.real, c.listed.real, c.key.real, d.couple.real]
@@ -217,9 +230,8 @@ class ContactAdjoint:
         inputs += [self.mode.real, self.z.real]
         s.each_real(self.k_touch.parts, c.capacity, inputs, [self.parts.real])
 
-    def _gather(self, p: Rows, outputs: list[wp.array], *, at_end: bool) -> None:
+    def _gather(self, motion: Any, outputs: list[wp.array], *, at_end: bool) -> None:
         c, s, d = self.contacts, self.shard, self.detector
-        motion, _fields = self._motion(p)
         inputs = [s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, motion]
         inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real]
         inputs += [c.multiplier.real, self.mode.real, self.way.real, self.parts.real]
@@ -230,9 +242,8 @@ class ContactAdjoint:
             self.embedded.spread(x_bar, v_bar)
 
     def _motion(self, p: Rows) -> tuple[Any, Any]:
-        """Where everything is and how it moves, and the velocities of dofs."""
+        """Where everything is and how it moves, and the velocities of dofs; nodes of modes have theirs by then."""
         s, w, fields = self.shard, self.shard.work, self.fields
-        self._expand(p, w.dof_v, self.u)
         velocities = [p, w.dof_v, w.dof_v0, self.u]
         if self.embedded is not None:
             velocities = self.embedded.velocities(velocities)

@@ -15,6 +15,7 @@ from softwarp.kernels.elements import (
     rest_adjoint,
     turned_adjoint,
     turned_directional,
+    volumetric_adjoint,
 )
 from softwarp.kernels.elements import adjoint as of_tets
 from softwarp.model.codes import TURNED
@@ -78,6 +79,11 @@ class TetAdjoint:
                 inputs += [t.size, t.frame, s.model.body_guard, w.body_mu.S, w.body_lam.S, stiffness.S]
                 outputs = [corner.S, self.parameter.S]
                 s.each(kernel, -(-int(chosen.size) // per_item), [*inputs, t.x.S, v.S, p.S, h], outputs)
+                continue
+            if law in volumetric_adjoint.LAWS and not s.variant.world_fastest:
+                k = volumetric_adjoint.kernels(s.variant, law, s.options.project_tangent, parameters)
+                inputs += [w.body_mu.S, w.body_lam.S, stiffness.S, t.x.S, v.S, p.S, h]
+                s.each(k.tet_adjoint, -(-int(chosen.size) // per_item), inputs, [corner.S, self.parameter.S])
                 continue
             kernel = of_tets.kernels(s.variant, law, s.options.project_tangent).tet_adjoint
             inputs += [s.model.body_law_start, w.body_mu.real, w.body_lam.real, s.input["law_parameter"].real]

@@ -113,8 +113,8 @@ class FloatingAdjoint:
         start.q.copy_from(i["mode_q0"])
         start.v.copy_from(i["mode_v0"])
         start.frame(0.0)
-        start.widen()
-        start.place()
+        start.x.copy_from(i["x0"])  # a step has placed them
+        start.node_v.copy_from(i["v0"])
         inputs = [r.mode_dof, i["mode_q0"].S, w.dof_v.S, self.h]
         s.each(self.term.k.trial_amplitude, r.count // 3, inputs, [end.q.S, end.v.S])
         end.frame(self.h)
@@ -177,6 +177,10 @@ class FloatingAdjoint:
 
     def _of_moments(self, moment_bar: Rows, mode_bar: Rows, bar: wp.array) -> None:
         s, m = self.shard, self.model
+        if not s.variant.world_fastest:
+            inputs = [s.lanes, m.moment_start, m.moment_first, m.moment_stride, m.moments, m.first, m.modes]
+            s.each_real(self.k.body_moment_bars, m.count, [*inputs, moment_bar.real, mode_bar.real], [bar])
+            return
         inputs = [s.lanes, m.moment_body, m.moment_start, m.moment_first, m.moment_stride, m.moments]
         inputs += [m.first, m.modes, moment_bar.real, mode_bar.real]
         s.each_real(self.k.moment_bars, int(m.moment_body.size), inputs, [bar])
@@ -189,7 +193,7 @@ class FloatingAdjoint:
         inputs = [m.listed, m.listed_body, self.term.model.node, m.block, self.term.model.mode_dof, m.radius]
         inputs += [at.turn.real, at.centre.real, at.x.real, s.work.dof_v.real, p.real]
         outputs = [self.own_v.real, self.own_p.real, node_v.real, node_p.real]
-        s.each_real(self.k.turn_fields, int(m.listed.size), inputs, outputs)
+        s.each_real(self.k.turn_fields, s.variant.parts(int(m.listed.size)), inputs, outputs)
 
     def pull(
         self,
@@ -218,11 +222,11 @@ class FloatingAdjoint:
         s.each_real(k.split_stiffness, s.model.body_count, inputs, outputs)
         self.asks = parameters
         held: list[tuple[Rows, Rows, int, int]] = [(corner, self.corner, 1, -1)]
-        if tets is not None:
+        if tets is not None and parameters:
             held.append((tets.parameter, tets.parameter, of_tets.ROWS, of_tets.PARAMETERS))
-        if skin is not None:
+        if skin is not None and parameters:
             held.append((skin.parameter, skin.parameter, membrane_adjoint.PARAMETERS, 2))
-        if not self.parameter:
+        if len(self.parameter) < len(held):
             self.parameter = [s.rows(part.real.shape[1]) for part, _, _, _ in held]
         for v, along, stiffness, h in (
             (self.own_v, self.own_p, self.elastic, self.h),
@@ -233,9 +237,9 @@ class FloatingAdjoint:
             if skin is not None:
                 skin.pull(v, along, stiffness, h, corner)
             if h > 0.0:
-                for (part, _, _, _), room in zip(held, self.parameter, strict=True):
+                for (part, _, _, _), room in zip(held, self.parameter, strict=False):
                     room.copy_from(part)
-        for (part, _, size, omit), room in zip(held, self.parameter, strict=True):
+        for (part, _, size, omit), room in zip(held, self.parameter, strict=False):
             s.each_real(k.join, part.real.shape[1], [size, omit, room.real], [part.real])
         given = [m.block, r.mode_dof, m.radius, w.body_damping.real, w.frame_axes.real]
         given += [node_v.real, node_p.real, w.dof_v.real, p.real]

@@ -145,7 +145,7 @@ class Looking(StepAdjoint):
         self._look_back()
         s.each_real(k.ways, c.capacity, [c.count.real, self.first.look.real, self.contact.z.real], [self.ways.real])
         for bar, part, total in self.sums.values():
-            s.each_real(k.hand_over, bar.shape[1], [s.lanes, part], [bar, total])
+            s.each_real(k.hand_over, s.variant.parts(bar.shape[1]), [s.lanes, part], [bar, total])
         c.multiplier.copy_from(self.ways)
         self.extra.zero()
         self.contact.laws.add_forces(self.extra, self.h)
@@ -163,7 +163,7 @@ class Looking(StepAdjoint):
         self.comes_first = False
         self.contact.look, self.contact.later = self.first.look, None
         for bar, _part, total in self.sums.values():
-            s.each_real(k.take_back, bar.shape[1], [s.lanes, total], [bar])
+            s.each_real(k.take_back, s.variant.parts(bar.shape[1]), [s.lanes, total], [bar])
 
     def _contacts_to_state(self, contact: ContactAdjoint) -> None:
         super()._contacts_to_state(contact)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import mode_adjoint, mode_loads, reduction
+from softwarp.kernels.elements import adjoint_sums, mode_adjoint, mode_loads, reduction
 from softwarp.model.gradients import Gradients
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.floating_adjoint import FloatingAdjoint
@@ -35,13 +35,23 @@ class ModeAdjoint:
         self.start = wp.array(m.start, dtype=wp.int32, device=shard.device)
         self.at_zero = wp.zeros_like(m.node_rest)
         self.listed_v = shard.rows(3 * int(m.node.size))
+        self.k_sums = adjoint_sums.kernels(shard.variant)
         self.frames = None if m.floating is None else FloatingAdjoint(shard, term, h, gradients)
+        self.is_lone = False
 
     def take(self, *, at_end: bool = False) -> None:
         """Gradients by nodes, at the start of a step or at its end, become those by modes that they follow from."""
         s, m, g = self.shard, self.model, self.gradients
+        if self.is_lone and not at_end:  # ``sum`` has those by positions, and there are no others
+            if self.frames is not None:
+                self.listed_v.zero()
+                self.frames.turn_bars(self.listed, self.listed_v, at_end=False)
+                self._add(self.listed_v, g.mode_v)
+            self._add(self.listed, g.mode_q)
+            return
+        parts = s.variant.parts(int(m.node.size))
         for by_nodes, listed in ((g.node_x, self.listed), (g.node_v, self.listed_v)):
-            s.each_real(self.k.take_nodes, int(m.node.size), [s.lanes, m.node], [by_nodes, listed.real])
+            s.each_real(self.k.take_nodes, parts, [s.lanes, m.node], [by_nodes, listed.real])
         if self.frames is not None:
             if at_end:
                 self.frames.take_turns()
@@ -79,12 +89,27 @@ class ModeAdjoint:
         inputs = [self.h, s.lanes, m.mode_dof, g.mode_q, g.mode_v]
         s.each_real(self.k.seed, m.count // 3, inputs, [seed.real, y.real])
 
-    def place(self, v: Rows, p: Rows, node_v: Rows, node_p: Rows) -> None:
-        """Velocities and p of nodes, from those of dofs."""
+    def sum(self, sums: list[wp.array]) -> None:
+        """Gradients by listed nodes from those by corners and points; those behind the active ones have none."""
+        s, m = self.shard, self.model
+        self.listed.zero()
+        s.each(self.k_sums.listed_sums, m.active_count, [m.node, *sums], [self.listed.S])
+
+    def place(self, v: Rows, p: Rows, node_v: Rows, node_p: Rows, *, everywhere: bool = True) -> None:
+        """Velocities and p of nodes, from those of dofs.
+
+        Args:
+            v: Velocities of dofs.
+            p: Adjoint of these.
+            node_v: Receives those of nodes.
+            node_p: Likewise.
+            everywhere: Whether nodes are asked for that no element or row needs, which have forces alone.
+        """
         s, m, t = self.shard, self.model, self.term
         for dofs, wide in ((v, self.wide_v), (p, self.wide_p)):
             s.each(self.k_modes.widen_dofs, m.wide_count, [m.wide_mode, m.mode_dof, dofs.S], [wide.S])
-        t.place_both(self.at_zero, self.wide_v, self.wide_p, node_v, node_p)
+        count = int(m.node.size) if everywhere else m.active_count
+        t.place_both(self.at_zero, self.wide_v, self.wide_p, node_v, node_p, count)
         if self.frames is not None:
             self.frames.place(p, node_v, node_p)
 

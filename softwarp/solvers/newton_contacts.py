@@ -50,10 +50,11 @@ class EndContacts(ContactAdjoint):
         self.find_way(p, self.way)
         for part in (self.by_x, self.by_pose, *self.by_start):
             part.zero_()
-        self._find_parts(p, c.axes, 9, at_end=True)
+        moving = self._motion(p)
+        self._find_parts(moving, c.axes, 9, at_end=True)
         by_v, by_twist, by_command = self.by_start
         outputs = [self.by_x, by_v, self.gradients.pair_mu, self.by_pose, by_twist, by_command]
-        self._gather(p, outputs, at_end=False)
+        self._gather(moving[0], outputs, at_end=False)
         s.each_real(self.k_end.add_places, self.by_x.shape[1], [s.lanes, self.by_x], [node_bar.real])
         if there is not None:
             inputs = [s.lanes, self.by_pose, s.work.pose.real]

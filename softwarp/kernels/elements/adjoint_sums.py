@@ -20,7 +20,7 @@ from softwarp.kernels.elements.adjoint import PARAMETERS, ROWS
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
-    S, real, world_fastest = variant.S, variant.real, variant.world_fastest
+    S, real, mul, world_fastest = variant.S, variant.real, variant.mul, variant.world_fastest
     module = variant.module("adjoint.step")
     one = single.functions(variant)
     vec3, vector_at = one.vec3, one.vector_at
@@ -95,6 +95,39 @@ def kernels(variant: Variant) -> SimpleNamespace:
             node_p_out[w, 3 * node + c] = p
             node_mass_p_out[w, 3 * node + c] = p * node_volume[node]
 
+    @wp.func
+    def sum_at(
+        node: int,
+        corner_start: wp.array(dtype=wp.int32),
+        corner: wp.array(dtype=wp.int32),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        corner_bar: wp.array2d(dtype=S),
+        point_bar: wp.array2d(dtype=S),
+        w: int,
+        out: wp.array2d(dtype=S),
+        row_out: int,
+    ):
+        """Sum of the gradients by corners of elements and by points of rows that one node carries, into three rows."""
+        x = S(real(0.0))
+        y = S(real(0.0))
+        z = S(real(0.0))
+        for i in range(corner_start[node], corner_start[node + 1]):
+            row = 3 * corner[i]
+            x += corner_bar[w, row]
+            y += corner_bar[w, row + 1]
+            z += corner_bar[w, row + 2]
+        for i in range(node_point_start[node], node_point_start[node + 1]):
+            row = 3 * node_point[i]
+            weight = node_point_weight[i]
+            x += point_bar[w, row] * weight
+            y += point_bar[w, row + 1] * weight
+            z += point_bar[w, row + 2] * weight
+        out[w, row_out] = x
+        out[w, row_out + 1] = y
+        out[w, row_out + 2] = z
+
     @wp.kernel(module=module, enable_backward=False)
     def node_sums(
         # Model
@@ -109,27 +142,73 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         node_bar_out: wp.array2d(dtype=S),
     ):
-        """Sum of the gradients by corners of elements and by points of rows that one node carries."""
+        """See ``sum_at``."""
         w, node = wp.tid()
         if wp.static(world_fastest):
             node, w = wp.tid()
-        x = S(real(0.0))
-        y = S(real(0.0))
-        z = S(real(0.0))
-        for i in range(corner_start[node], corner_start[node + 1]):
-            row = 3 * corner[i]
-            x += corner_bar_in[w, row]
-            y += corner_bar_in[w, row + 1]
-            z += corner_bar_in[w, row + 2]
-        for i in range(node_point_start[node], node_point_start[node + 1]):
-            row = 3 * node_point[i]
-            weight = node_point_weight[i]
-            x += point_bar_in[w, row] * weight
-            y += point_bar_in[w, row + 1] * weight
-            z += point_bar_in[w, row + 2] * weight
-        node_bar_out[w, 3 * node] = x
-        node_bar_out[w, 3 * node + 1] = y
-        node_bar_out[w, 3 * node + 2] = z
+        sum_at(
+            node,
+            corner_start,
+            corner,
+            node_point_start,
+            node_point,
+            node_point_weight,
+            corner_bar_in,
+            point_bar_in,
+            w,
+            node_bar_out,
+            3 * node,
+        )
+
+    @wp.kernel(module=module, enable_backward=False)
+    def listed_sums(
+        # Model
+        listed: wp.array(dtype=wp.int32),
+        corner_start: wp.array(dtype=wp.int32),
+        corner: wp.array(dtype=wp.int32),
+        node_point_start: wp.array(dtype=wp.int32),
+        node_point: wp.array(dtype=wp.int32),
+        node_point_weight: wp.array(dtype=real),
+        # Workspace in
+        corner_bar_in: wp.array2d(dtype=S),
+        point_bar_in: wp.array2d(dtype=S),
+        # Workspace out
+        listed_bar_out: wp.array2d(dtype=S),
+    ):
+        """The same of one node of a list, in its order."""
+        w, i = wp.tid()
+        if wp.static(world_fastest):
+            i, w = wp.tid()
+        sum_at(
+            listed[i],
+            corner_start,
+            corner,
+            node_point_start,
+            node_point,
+            node_point_weight,
+            corner_bar_in,
+            point_bar_in,
+            w,
+            listed_bar_out,
+            3 * i,
+        )
+
+    @wp.kernel(module=module, enable_backward=False)
+    def node_forces(
+        h: real,
+        lanes: int,
+        # Workspace in
+        node_p_in: wp.array3d(dtype=real),
+        # State out
+        force_bar_out: wp.array2d(dtype=real),
+    ):
+        """Gradient by the forces on nodes, which is all that they have where they follow modes."""
+        pack, part, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < force_bar_out.shape[0]:
+            first, last = rows_of(part, force_bar_out.shape[1])
+            for row in range(first, last):
+                force_bar_out[world, row] = h * node_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
     def nodes(
@@ -300,11 +379,72 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 rest_bar_out[world, 3 * node + c] = rest_bar_out[world, 3 * node + c] + total[c]
 
+    @wp.kernel(module=module, enable_backward=False)
+    def points(
+        h: real,
+        # Model
+        point_node: wp.array2d(dtype=wp.int32),
+        point_weight: wp.array2d(dtype=real),
+        point_row: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_v_in: wp.array2d(dtype=S),
+        node_p_in: wp.array2d(dtype=S),
+        multiplier_in: wp.array2d(dtype=S),
+        q_in: wp.array2d(dtype=S),
+        # Workspace out
+        way_out: wp.array2d(dtype=S),
+    ):
+        """h T p - h q v of one point of a cable or a chamber."""
+        w, point = wp.tid()
+        if wp.static(world_fastest):
+            point, w = wp.tid()
+        row = point_row[point]
+        by_p = multiplier_in[w, row] * h
+        by_v = q_in[w, row] * -h
+        x = S(real(0.0))
+        y = S(real(0.0))
+        z = S(real(0.0))
+        for k in range(4):
+            node = 3 * point_node[point, k]
+            if node >= 0:
+                weight = point_weight[point, k]
+                x += (mul(by_p, node_p_in[w, node]) + mul(by_v, node_v_in[w, node])) * weight
+                y += (mul(by_p, node_p_in[w, node + 1]) + mul(by_v, node_v_in[w, node + 1])) * weight
+                z += (mul(by_p, node_p_in[w, node + 2]) + mul(by_v, node_v_in[w, node + 2])) * weight
+        way_out[w, 3 * point] = x
+        way_out[w, 3 * point + 1] = y
+        way_out[w, 3 * point + 2] = z
+
+    @wp.kernel(module=module, enable_backward=False)
+    def kept_sides(
+        # Model
+        size: int,
+        row_dof: wp.array(dtype=wp.int32),
+        row_side: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        row_in: wp.array2d(dtype=S),
+        # Workspace out
+        y_out: wp.array2d(dtype=S),
+    ):
+        """One 3-entry of H' among the right-hand sides, of rows that the step has left."""
+        w, entry = wp.tid()
+        if wp.static(world_fastest):
+            entry, w = wp.tid()
+        dof = row_dof[entry]
+        target = 3 * ((1 + row_side[entry]) * size + dof)
+        for c in range(3):
+            y_out[w, target + c] = row_in[w, 3 * entry + c] * dof_free[dof, c]
+
     return SimpleNamespace(
+        points=points,
+        kept_sides=kept_sides,
         rest_nodes=rest_nodes,
         seed=seed,
         to_nodes=to_nodes,
         node_sums=node_sums,
+        listed_sums=listed_sums,
+        node_forces=node_forces,
         nodes=nodes,
         bodies=bodies,
         moduli=moduli,

@@ -17,11 +17,34 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements.floating_inertia import MEANS
 from softwarp.model.floating import RIGID
 
+# Sixteen amplitudes side by side; each has the sums over modes k and entries c in their order.
+_MOMENT_BARS = """
+#pragma clang fp contract(off)
+const int lanes = moment_bar.shape[2];
+const REAL* bar = &wp::index(moment_bar, pack, 9 * begin, lane);
+const REAL* own = &wp::index(mode_bar, pack, mode, lane);
+REAL* out = &wp::index(bar_out, world, mode);
+for (int first = 0; first < count; first += 16) {
+    REAL total[16];
+    for (int l = 0; l < 16; ++l) total[l] = first + l < count ? own[(first + l) * lanes] : 0;
+    for (int k = 0; k < count; ++k) {
+        if (k > 0 && k < rigid) continue;
+        for (int c = 0; c < 9; ++c) {
+            const REAL share = bar[(9 * k + c) * lanes];
+            const REAL* column = &wp::index(moments, at) + (9 * k + c) * stride + first;
+            for (int l = 0; l < 16; ++l) total[l] += column[l] * share;
+        }
+    }
+    for (int l = 0; l < 16; ++l)
+        if (first + l >= rigid && first + l < count) out[first + l] = out[first + l] + total[l];
+}
+"""
+
 
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of one scalar type."""
-    real = variant.real
+    real, world_fastest = variant.real, variant.world_fastest
     module = variant.module("adjoint.floating")
     one = single.functions(variant)
     vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
@@ -468,6 +491,79 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         total += moments[at + c * stride] * moment_bar_in[pack, 9 * (moment_start[f] + k) + c, lane]
             bar_out[world, first[f] + own] = bar_out[world, first[f] + own] + total
 
+    @wp.func_native(_MOMENT_BARS.replace("REAL", "double" if real is wp.float64 else "float"))
+    def add_moments(
+        moments: wp.array(dtype=real),
+        at: int,
+        stride: int,
+        count: int,
+        begin: int,
+        rigid: int,
+        moment_bar: wp.array3d(dtype=real),
+        mode_bar: wp.array3d(dtype=real),
+        mode: int,
+        pack: int,
+        lane: int,
+        world: int,
+        bar_out: wp.array2d(dtype=real),
+    ):
+        """What ``moment_bars`` adds for all amplitudes of one body."""
+
+    @wp.kernel(module=module, enable_backward=False)
+    def body_moment_bars(
+        lanes: int,
+        # Model
+        moment_start: wp.array(dtype=wp.int32),
+        moment_first: wp.array(dtype=wp.int32),
+        moment_stride: wp.array(dtype=wp.int32),
+        moments: wp.array(dtype=real),
+        first: wp.array(dtype=wp.int32),
+        modes: wp.array(dtype=wp.int32),
+        # Workspace in
+        moment_bar_in: wp.array3d(dtype=real),
+        mode_bar_in: wp.array3d(dtype=real),
+        # State out
+        bar_out: wp.array2d(dtype=real),
+    ):
+        """``moment_bars`` of all amplitudes of one body, on a CPU."""
+        pack, f, lane = wp.tid()
+        world = pack * lanes + lane
+        begin = moment_start[f]
+        if world < bar_out.shape[0]:
+            add_moments(
+                moments,
+                moment_first[begin],
+                moment_stride[begin],
+                modes[f],
+                begin,
+                wp.static(RIGID),
+                moment_bar_in,
+                mode_bar_in,
+                first[f],
+                pack,
+                lane,
+                world,
+                bar_out,
+            )
+
+    @wp.func
+    def turn_field(
+        turn: mat33,
+        v: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        row: int,
+        along: vec3,
+        about: vec3,
+        r: vec3,
+        own_out: wp.array3d(dtype=real),
+        out: wp.array3d(dtype=real),
+    ):
+        """What modes have at one node, in the world's axes, and all of it."""
+        own = turn * vector_at(v, pack, lane, row)
+        put(own_out, pack, lane, row, own)
+        put(out, pack, lane, row, own + along + wp.cross(about, r))
+
     @wp.kernel(module=module, enable_backward=False)
     def turn_fields(
         # Model
@@ -489,22 +585,36 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_v_out: wp.array3d(dtype=real),
         node_p_out: wp.array3d(dtype=real),
     ):
-        """v and p of one listed node: what its modes have, in the world's axes, and all of it."""
-        pack, item, lane = wp.tid()
-        f = listed_body[item]
-        row = 3 * node[listed[item]]
-        R = rotation(turn_in, pack, lane, f)
-        r = vector_at(x_in, pack, lane, row) - vector_at(centre_in, pack, lane, 3 * f)
-        along = 3 * mode_dof[block[f]]
-        about = 3 * mode_dof[block[f] + 1]
-        v = R * vector_at(node_v_out, pack, lane, row)
-        p = R * vector_at(node_p_out, pack, lane, row)
-        put(own_v_out, pack, lane, row, v)
-        put(own_p_out, pack, lane, row, p)
-        v += vector_at(dof_v_in, pack, lane, along)
-        p += vector_at(dof_p_in, pack, lane, along)
-        put(node_v_out, pack, lane, row, v + wp.cross(vector_at(dof_v_in, pack, lane, about) / radius[f], r))
-        put(node_p_out, pack, lane, row, p + wp.cross(vector_at(dof_p_in, pack, lane, about) / radius[f], r))
+        """v and p of one listed node: what its modes have, in the world's axes, and all of it; on a CPU of all."""
+        pack, part, lane = wp.tid()
+        begin = int(0)
+        end = listed.shape[0]
+        if wp.static(world_fastest):
+            begin = part
+            end = part + 1
+        known = int(-1)
+        R = mat33()
+        c = vec3()
+        v = vec3()
+        w = vec3()
+        p = vec3()
+        q = vec3()
+        for item in range(begin, end):
+            f = listed_body[item]
+            if f != known:
+                known = f
+                R = rotation(turn_in, pack, lane, f)
+                c = vector_at(centre_in, pack, lane, 3 * f)
+                along = 3 * mode_dof[block[f]]
+                about = 3 * mode_dof[block[f] + 1]
+                v = vector_at(dof_v_in, pack, lane, along)
+                w = vector_at(dof_v_in, pack, lane, about) / radius[f]
+                p = vector_at(dof_p_in, pack, lane, along)
+                q = vector_at(dof_p_in, pack, lane, about) / radius[f]
+            row = 3 * node[listed[item]]
+            r = vector_at(x_in, pack, lane, row) - c
+            turn_field(R, node_v_out, pack, lane, row, v, w, r, own_v_out, node_v_out)
+            turn_field(R, node_p_out, pack, lane, row, p, q, r, own_p_out, node_p_out)
 
     return SimpleNamespace(
         take_turns=take_turns,
@@ -514,5 +624,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         turn_back=turn_back,
         trial_back=trial_back,
         moment_bars=moment_bars,
+        body_moment_bars=body_moment_bars,
         turn_fields=turn_fields,
     )

@@ -18,7 +18,7 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
-    real = variant.real
+    real, world_fastest = variant.real, variant.world_fastest
     module = variant.module("adjoint.modes")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -31,15 +31,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         listed_out: wp.array3d(dtype=real),
     ):
-        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards."""
-        pack, i, lane = wp.tid()
+        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards; on a CPU of all."""
+        pack, part, lane = wp.tid()
         world = pack * lanes + lane
-        for c in range(3):
-            value = real(0.0)
-            if world < bar_out.shape[0]:
-                value = bar_out[world, 3 * node[i] + c]
-                bar_out[world, 3 * node[i] + c] = real(0.0)
-            listed_out[pack, 3 * i + c, lane] = value
+        first = int(0)
+        last = node.shape[0]
+        if wp.static(world_fastest):
+            first = part
+            last = part + 1
+        for i in range(first, last):
+            for c in range(3):
+                value = real(0.0)
+                if world < bar_out.shape[0]:
+                    value = bar_out[world, 3 * node[i] + c]
+                    bar_out[world, 3 * node[i] + c] = real(0.0)
+                listed_out[pack, 3 * i + c, lane] = value
 
     @wp.kernel(module=module, enable_backward=False)
     def add_modes(

@@ -29,7 +29,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("adjoint.rows")
     one = single.functions(variant)
-    vec3, vector_at, put = one.vec3, one.vector_at, one.put
+    vector_at, put = one.vector_at, one.put
     dependent = DEPENDENT[real]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -331,35 +331,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 stiffness_bar_out[world, cable] = stiffness_bar_out[world, cable] + by_k
                 damping_bar_out[world, cable] = damping_bar_out[world, cable] + by_c
 
-    @wp.kernel(module=module, enable_backward=False)
-    def points(
-        h: real,
-        # Model
-        point_node: wp.array2d(dtype=wp.int32),
-        point_weight: wp.array2d(dtype=real),
-        point_row: wp.array(dtype=wp.int32),
-        # Workspace in
-        node_v_in: wp.array3d(dtype=real),
-        node_p_in: wp.array3d(dtype=real),
-        multiplier_in: wp.array3d(dtype=real),
-        q_in: wp.array3d(dtype=real),
-        # Workspace out
-        way_out: wp.array3d(dtype=real),
-    ):
-        """h T p - h q v of one point of a cable or a chamber."""
-        pack, point, lane = wp.tid()
-        row = point_row[point]
-        by_p = h * multiplier_in[pack, row, lane]
-        by_v = -h * q_in[pack, row, lane]
-        way = vec3()
-        for k in range(4):
-            node = point_node[point, k]
-            if node >= 0:
-                here = by_p * vector_at(node_p_in, pack, lane, 3 * node)
-                here += by_v * vector_at(node_v_in, pack, lane, 3 * node)
-                way += point_weight[point, k] * here
-        put(way_out, pack, lane, 3 * point, way)
-
     @wp.func
     def segment(x: wp.array3d(dtype=real), way: wp.array3d(dtype=real), pack: int, lane: int, last: int, closing: real):
         """Change of the gradient at the first point of the cable segment that ends in point ``last``, by the ways."""
@@ -426,6 +397,5 @@ def kernels(variant: Variant) -> SimpleNamespace:
         cable_seed=cable_seed,
         cable_command=cable_command,
         cable_stretch=cable_stretch,
-        points=points,
         cable_points=cable_points,
     )

@@ -41,16 +41,43 @@ for (int p = 3 * begin; p < 3 * end; p += 3)
 *(number_t*)&wp::index(volume_out, w, cavity) = total * ((REAL)1 / (REAL)3);
 """
 
+# The change of the gradient along ways of points: (b - a) x (c - a) by both factors, for all three corners.
+_ALONG = """
+#pragma clang fp contract(fast)
+typedef REAL number_t NUMBER;
+const int* tri = cavity_tri.data;
+const number_t* x = (const number_t*)&wp::index(point_x, w, 0);
+const number_t* y = (const number_t*)&wp::index(way, w, 0);
+const number_t* g = (const number_t*)&wp::index(gradient, w, 0);
+const number_t share = *(const number_t*)&wp::index(measured, w, row);
+number_t* out = (number_t*)&wp::index(point_bar_out, w, 0);
+for (int i = 3 * begin; i < 3 * end; ++i) out[i] = x[i] - x[i];
+for (int t = 3 * tri_begin; t < 3 * tri_end; t += 3) {
+    const int a = 3 * tri[t], b = 3 * tri[t + 1], c = 3 * tri[t + 2];
+    const number_t b0 = x[b] - x[a], b1 = x[b + 1] - x[a + 1], b2 = x[b + 2] - x[a + 2];
+    const number_t c0 = x[c] - x[a], c1 = x[c + 1] - x[a + 1], c2 = x[c + 2] - x[a + 2];
+    const number_t u0 = y[b] - y[a], u1 = y[b + 1] - y[a + 1], u2 = y[b + 2] - y[a + 2];
+    const number_t v0 = y[c] - y[a], v1 = y[c + 1] - y[a + 1], v2 = y[c + 2] - y[a + 2];
+    const number_t n0 = (u1 * c2 - u2 * c1) + (b1 * v2 - b2 * v1);
+    const number_t n1 = (u2 * c0 - u0 * c2) + (b2 * v0 - b0 * v2);
+    const number_t n2 = (u0 * c1 - u1 * c0) + (b0 * v1 - b1 * v0);
+    out[a] += n0, out[a + 1] += n1, out[a + 2] += n2;
+    out[b] += n0, out[b + 1] += n1, out[b + 2] += n2;
+    out[c] += n0, out[c + 1] += n1, out[c + 2] += n2;
+}
+for (int i = 3 * begin; i < 3 * end; ++i) out[i] = out[i] * scale + share * g[i];
+"""
+
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
-    """``measure_cavity`` for one scalar type of a CPU."""
+    """``measure_cavity`` for one scalar type of a CPU, and ``points_along`` for gradients."""
     S, real = variant.S, variant.real
     name = "double" if real is wp.float64 else "float"
     lanes = f"__attribute__((vector_size({4 * LANE_COUNT}), aligned(4)))" if variant.lanes > 1 else ""
-    source = _SURFACE.replace("NUMBER", lanes).replace("REAL", name)
+    surface_source, along_source = (text.replace("NUMBER", lanes).replace("REAL", name) for text in (_SURFACE, _ALONG))
 
-    @wp.func_native(source)
+    @wp.func_native(surface_source)
     def surface(
         cavity_tri: wp.array2d(dtype=wp.int32),
         point_x: wp.array2d(dtype=S),
@@ -102,4 +129,56 @@ def kernels(variant: Variant) -> SimpleNamespace:
             volume_out,
         )
 
-    return SimpleNamespace(measure_cavity=measure_cavity)
+    @wp.func_native(along_source)
+    def along(
+        cavity_tri: wp.array2d(dtype=wp.int32),
+        point_x: wp.array2d(dtype=S),
+        gradient: wp.array2d(dtype=S),
+        way: wp.array2d(dtype=S),
+        measured: wp.array2d(dtype=S),
+        w: int,
+        row: int,
+        begin: int,
+        end: int,
+        tri_begin: int,
+        tri_end: int,
+        scale: real,
+        point_bar_out: wp.array2d(dtype=S),
+    ):
+        """Change of one chamber's gradient along ways, times a scale, and a share of the gradient."""
+
+    @wp.kernel(module=variant.module("adjoint.surface"), enable_backward=False)
+    def points_along(
+        first_row: int,
+        # Model
+        cavity_point_start: wp.array(dtype=wp.int32),
+        cavity_tri_start: wp.array(dtype=wp.int32),
+        cavity_tri: wp.array2d(dtype=wp.int32),
+        cavity_area: wp.array(dtype=real),
+        # Workspace in
+        point_x_in: wp.array2d(dtype=S),
+        point_gradient_in: wp.array2d(dtype=S),
+        way_in: wp.array2d(dtype=S),
+        measured_in: wp.array2d(dtype=S),
+        # Workspace out
+        point_bar_out: wp.array2d(dtype=S),
+    ):
+        """Gradient by the points of one chamber's surface; ``cavity_adjoint.cavity_points`` has it by rings."""
+        w, cavity = wp.tid()
+        along(
+            cavity_tri,
+            point_x_in,
+            point_gradient_in,
+            way_in,
+            measured_in,
+            w,
+            first_row + cavity,
+            cavity_point_start[cavity],
+            cavity_point_start[cavity + 1],
+            cavity_tri_start[cavity],
+            cavity_tri_start[cavity + 1],
+            real(1.0) / (real(6.0) * cavity_area[cavity]),
+            point_bar_out,
+        )
+
+    return SimpleNamespace(measure_cavity=measure_cavity, points_along=points_along)

@@ -23,6 +23,7 @@ import warp as wp
 
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.rows import elimination
 from softwarp.model.codes import SLOTS
 
 SLIPS = {wp.float64: 1.0e-8, wp.float32: 1.0e-4}  # relative distance of friction from its bound up to which it slips
@@ -170,10 +171,16 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         order: int,
         total: int,
         i: int,
+        is_new: bool,
+        at: int,
+        place: int,
         matrix_out: wp.array3d(dtype=real),
         change_out: wp.array3d(dtype=real),
     ):
-        """One row of the equations for the change of q and z: coefficients, and the right-hand side in ``change``."""
+        """One row of the equations for the change of q and z: coefficients, and the right-hand side in ``change``.
+
+        The matrix is that at ``at`` and ``place``, and stays as it is unless it ``is_new``.
+        """
         own = real(1.0)  # factors of this row of W, of the two tangents' rows, and of the unit matrix
         first = real(0.0)
         second = real(0.0)
@@ -219,6 +226,9 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         right = own * gap[pack, i, lane] - before
         if first != real(0.0) or second != real(0.0):
             right += first * gap[pack, t, lane] + second * gap[pack, u, lane]
+        change_out[pack, i, lane] = wp.where(is_open, real(0.0), right)
+        if not is_new:
+            return
         for j in range(total):
             entry = own * delassus[pack, i * order + j, lane]
             if first != real(0.0) or second != real(0.0):
@@ -229,8 +239,7 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 entry += pressed
             if is_open:
                 entry = wp.where(i == j, real(1.0), real(0.0))
-            matrix_out[pack, i * order + j, lane] = entry
-        change_out[pack, i, lane] = wp.where(is_open, real(0.0), right)
+            matrix_out[at, i * order + j, place] = entry
 
     @wp.func
     def swap(
@@ -305,6 +314,9 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 order,
                 total,
                 i,
+                True,
+                pack,
+                lane,
                 matrix_out,
                 change_out,
             )
@@ -370,4 +382,88 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         for i in range(total, order):
             change_out[pack, i, lane] = real(0.0)
 
-    return SimpleNamespace(known_gaps=known_gaps, modes=modes, solve=solve)
+    result = SimpleNamespace(known_gaps=known_gaps, modes=modes, solve=solve)
+    if variant.world_fastest:
+        return result
+    factor, eliminate = elimination.functions(real).factor, elimination.functions(real).solve
+
+    @wp.kernel(module=module, enable_backward=False)
+    def solve_again(
+        rows: int,
+        order: int,
+        is_new: bool,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        delassus_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        softness_in: wp.array3d(dtype=real),
+        active_in: wp.array3d(dtype=wp.int32),
+        mode_in: wp.array3d(dtype=real),
+        mu_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
+        offset_in: wp.array3d(dtype=real),
+        # Workspace out
+        matrix_out: wp.array3d(dtype=real),
+        held_out: wp.array3d(dtype=real),
+        change_out: wp.array3d(dtype=real),
+        q_out: wp.array3d(dtype=real),
+        z_out: wp.array3d(dtype=real),
+        unsure_out: wp.array3d(dtype=wp.int32),
+    ):
+        """``solve`` on a CPU, where factors of a matrix that is not new serve again."""
+        pack, lane = wp.tid()
+        world = pack * gap_in.shape[2] + lane
+        total = rows + 3 * count_in[pack, 0, lane]
+        for i in range(total):
+            equation(
+                delassus_in,
+                compliance_in,
+                softness_in,
+                active_in,
+                mode_in,
+                mu_in,
+                gap_in,
+                offset_in,
+                q_out,
+                z_out,
+                pack,
+                lane,
+                rows,
+                order,
+                total,
+                i,
+                is_new,
+                world,
+                0,
+                matrix_out,
+                change_out,
+            )
+            if is_new:
+                held_out[world, i, 0] = unit_of(delassus_in, pack, lane, order, i)
+        if is_new:
+            factor(matrix_out, held_out, world, order, total, real(wp.static(dependent)))
+        scale = real(0.0)
+        for i in range(total):
+            known = real(0.0)
+            if i >= rows:
+                known = delassus_in[pack, i * order + i, lane] * z_out[pack, i - rows, lane]
+            right = change_out[pack, i, lane]
+            largest = held_out[world, order + i, 0]
+            if largest > real(0.0):
+                right = right / largest
+                known = known / largest
+            held_out[world, 2 * order + i, 0] = right
+            scale = wp.max(scale, wp.max(wp.abs(right), wp.abs(known)))
+        if eliminate(matrix_out, held_out, world, order, total, real(wp.static(unsolved)) * scale) != 0:
+            unsure_out[pack, 0, lane] = 1
+        for i in range(total):
+            value = held_out[world, 2 * order + i, 0] * held_out[world, i, 0]
+            change_out[pack, i, lane] = value
+            if i < rows:
+                q_out[pack, i, lane] = q_out[pack, i, lane] + value
+            else:
+                z_out[pack, i - rows, lane] = z_out[pack, i - rows, lane] + value
+        for i in range(total, order):
+            change_out[pack, i, lane] = real(0.0)
+
+    return SimpleNamespace(**vars(result), solve_again=solve_again)

@@ -21,7 +21,7 @@ from softwarp.kernels.rows.touch_adjoint import AT_START, BOUNCED, LATE, MEASURE
 @single_worlds
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type, on single worlds: (pack, row, lane)."""
-    real = variant.real
+    real, world_fastest = variant.real, variant.world_fastest
     module = variant.module("adjoint.look")
     one = single.functions(variant)
     vector_at, put = one.vector_at, one.put
@@ -137,6 +137,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 force = force_in[pack, 3 * contact + c, lane]
             force_out[pack, 3 * contact + c, lane] = force
 
+    @wp.func
+    def rows_of(part: int, count: int):
+        """First and last row of a thread."""
+        if wp.static(world_fastest):
+            return part, part + 1
+        return 0, count
+
     @wp.kernel(module=module, enable_backward=False)
     def hand_over(
         lanes: int,
@@ -146,12 +153,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         bar_out: wp.array2d(dtype=real),
         total_out: wp.array2d(dtype=real),
     ):
-        """Keep one row of a gradient as it is so far, and put that by the end of the first solution's way there."""
-        pack, row, lane = wp.tid()
+        """Keep a gradient as it is so far, and put that by the end of the first solution's way there.
+
+        On a GPU, a thread has one row.
+        """
+        pack, part, lane = wp.tid()
         world = pack * lanes + lane
         if world < bar_out.shape[0]:
-            total_out[world, row] = bar_out[world, row]
-            bar_out[world, row] = part_in[world, row]
+            first, last = rows_of(part, bar_out.shape[1])
+            for row in range(first, last):
+                total_out[world, row] = bar_out[world, row]
+                bar_out[world, row] = part_in[world, row]
 
     @wp.kernel(module=module, enable_backward=False)
     def take_back(
@@ -161,11 +173,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # State out
         bar_out: wp.array2d(dtype=real),
     ):
-        """Add what one row of a gradient was before."""
-        pack, row, lane = wp.tid()
+        """Add what a gradient was before, as ``hand_over`` has kept it."""
+        pack, part, lane = wp.tid()
         world = pack * lanes + lane
         if world < bar_out.shape[0]:
-            bar_out[world, row] = total_in[world, row] + bar_out[world, row]
+            first, last = rows_of(part, bar_out.shape[1])
+            for row in range(first, last):
+                bar_out[world, row] = total_in[world, row] + bar_out[world, row]
 
     return SimpleNamespace(
         looks=looks,

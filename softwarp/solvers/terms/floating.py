@@ -84,9 +84,8 @@ class FloatingFrames:
             (samples.TRI, m.tri_body, w.thin_stiffness),
         ):
             s.each_real(self.k.turn_stiffness, int(body.size), [size, body, w.frame_axes.real], [stiffness.real])
-        self._drag()
 
-    def _drag(self) -> None:
+    def drag(self) -> None:
         """What damping does where a body turns."""
         s, m, r, w = self.shard, self.model, self.modes, self.shard.work
         tets, thin = int(m.tet_body.size), s.model.membranes

@@ -43,10 +43,14 @@ class ReductionTerm(Term):
         for name in ("mode_q0", "mode_v0"):
             s.check_finite(i[name], self.model.count)
         if self.frames is None:
-            self._start()
+            if not s.is_settled:
+                self._start()
             return
         self.frames.start()
-        self._place(self.model.active_count)
+        if s.is_settled:
+            self._widen(w.mode_q, w.wide_q)
+        else:
+            self._place(self.model.active_count)
         self.frames.start_moments()
         self.frames.hold()
 
@@ -90,8 +94,8 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.tangent()
 
-    def sample(self) -> None:
-        """Stiffness of the elements that count."""
+    def sample(self, *, drag: bool = True) -> None:
+        """Stiffness of the elements that count, and in floating frames what damping does where a body turns."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.tet_sample, m.tet_turned, s.model.tet_body, w.body_mu.S, w.body_lam.S, w.body_stiffness.S]
         inputs += [w.tet_gradient.S, w.tet_stiffness.S]
@@ -101,6 +105,8 @@ class ReductionTerm(Term):
             s.each(self.k_sample.tri_stiffness, self.tris, inputs, [w.thin_stiffness.S])
         if self.frames is not None:
             self.frames.turn_stiffness()
+            if drag:
+                self.frames.drag()
 
     def _gather(self) -> None:
         """Their sum on a GPU."""
@@ -270,8 +276,10 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.place(count)
 
-    def place_both(self, rest: wp.array, one: Rows, other: Rows, first: Rows, second: Rows) -> None:
-        """Two sums of modes at all listed nodes.
+    def place_both(
+        self, rest: wp.array, one: Rows, other: Rows, first: Rows, second: Rows, count: int | None = None
+    ) -> None:
+        """Two sums of modes at listed nodes.
 
         Args:
             rest: What is added to the first sum, (listed, 3).
@@ -279,8 +287,10 @@ class ReductionTerm(Term):
             other: Likewise.
             first: Receives the sum by nodes of one.
             second: Of the other.
+            count: Of the first nodes of the list; None takes all.
         """
-        s, inputs, count = self.shard, [*self._basis(), rest, one.S, other.S], int(self.model.node.size)
+        s, inputs = self.shard, [*self._basis(), rest, one.S, other.S]
+        count = int(self.model.node.size) if count is None else count
         if self.k_place is not None:
             items = -(-count // mode_places.NODES)
             s.each(self.k_place.node_states, items, [count, *inputs], [first.S, second.S])

@@ -33,6 +33,7 @@ class Shard(Launches):
             makes.
         felt: What momentum and damping are found with: ``v0`` and ``twist0`` of the start, ``dof_v`` of now, and
             ``beta``, the factors of K that damp. A term that is ``leaning`` puts other ones here.
+        is_settled: Whether a step has left the state as it is: finite, and with nodes where modes have them.
         leaning: Whether one does, so that ``dof_v`` counts although no velocity has been found in this step.
     """
 
@@ -65,7 +66,7 @@ class Shard(Launches):
                 self._interleaved[name] = array, self.input[name]
             else:
                 self.input[name] = rows.alias(variant, array)
-        self.leaning = False
+        self.leaning = self.is_settled = False
         self.felt = {name: self.input[name] for name in ("v0", "twist0")}
         self.felt |= {"dof_v": self.work.dof_v, "beta": self.input["rayleigh_stiffness"]}
 
@@ -76,6 +77,8 @@ class Shard(Launches):
             self.each_real(self.k_state.interleave, None, inputs, [target.real])
 
     def check_finite(self, values: Rows, count: int) -> None:
-        """Raise the flags of worlds where one of the first rows of ``values`` is not finite."""
+        """Raise the flags of worlds where one of the first rows of ``values`` is not finite; none if ``is_settled``."""
+        if self.is_settled:
+            return
         inputs = [count, values.real]
         self.each_real(self.k_state.check_rows, self.variant.parts(count), inputs, [self.work.flag.real])
