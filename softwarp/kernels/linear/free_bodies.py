@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear import cholesky_panels
 
 BEARABLE = 2.0**16  # largest entry of A in masses of the body, up to which the mass keeps eight bits in float32
 ROOT_SHARE = 2.0**-18  # of the excess, which the last block receives while the factor is found: more than rounding
@@ -253,96 +252,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 y_out[pack, 3 * i + c, lane] = y_out[pack, 3 * i + c, lane] + mass * real(left[c])
 
-    return SimpleNamespace(
-        balance=balance,
-        mark=mark,
-        mend_root=mend_root,
-        residual=residual,
-        side_block=side_block,
-        inverse_root=inverse_root,
-        restore=restore,
-    )
-
-
-@cache
-def panel_kernels(variant: Variant) -> SimpleNamespace:
-    """The same for a factor in panels, whose substitution is that of all other sides."""
-    real = variant.real
-    module = variant.module("free_bodies.panel")
-    k = kernels(variant)
-    side_block, inverse_root, restore = k.side_block, k.inverse_root, k.restore
-    shared = cholesky_panels.kernels(variant)
-    block, store = shared.block, shared.store
-
-    @wp.kernel(module=module, enable_backward=False)
-    def place_masses(
-        size: int,
-        parts: int,
-        # Symbolic
-        dof_part: wp.array(dtype=wp.int32),
-        # Model
-        dof_node: wp.array(dtype=wp.int32),
-        node_body: wp.array(dtype=wp.int32),
-        # Workspace in
-        body_mass_scale_in: wp.array3d(dtype=real),
-        node_mass_in: wp.array3d(dtype=real),
-        excess_in: wp.array3d(dtype=real),
-        # Workspace out
-        skipped_out: wp.array2d(dtype=wp.int32),
-        y_out: wp.array3d(dtype=real),
-    ):
-        """Mass of the dofs of marked bodies along three axes, one right-hand side each; worlds without are skipped."""
-        pack, i, lane = wp.tid()
-        marked = int(0)
-        for part in range(parts):
-            if excess_in[pack, part, lane] > real(0.0):
-                marked = 1
-        if i == 0:
-            skipped_out[pack + lane, 0] = 1 - marked
-        if marked == 0:
-            return
-        mass = real(0.0)
-        part = dof_part[i]
-        if part >= 0:
-            if excess_in[pack, part, lane] > real(0.0):
-                node = dof_node[i]
-                mass = body_mass_scale_in[pack, node_body[node], lane] * node_mass_in[pack, node, lane]
-        for side in range(3):
-            for c in range(3):
-                y_out[pack, 3 * (side * size + i) + c, lane] = wp.where(c == side, mass, real(0.0))
-
-    @wp.kernel(module=module, enable_backward=False)
-    def mend_panel(
-        size: int,
-        # Symbolic
-        part_start: wp.array(dtype=wp.int32),
-        part_dof: wp.array(dtype=wp.int32),
-        position: wp.array(dtype=wp.int32),
-        column: wp.array(dtype=wp.vec4i),
-        # Workspace in
-        excess_in: wp.array3d(dtype=real),
-        root_in: wp.array3d(dtype=real),
-        y_in: wp.array3d(dtype=real),
-        # Workspace out
-        a_out: wp.array3d(dtype=real),
-        lower_out: wp.array2d(dtype=real),
-    ):
-        """Last column of the inverse of a marked body's last panel, as another last pivot has it."""
-        pack, part, lane = wp.tid()
-        if excess_in[pack, part, lane] <= real(0.0):
-            return
-        w = pack + lane
-        root = part_dof[part_start[part + 1] - 1]
-        entry = column[position[root]]
-        wide = entry[2]
-        old = wp.transpose(block(lower_out, w, entry[3] + entry[1] * wide + entry[1], wide * wide))
-        back = wp.inverse(old)
-        inverse = inverse_root(back * side_block(y_in, pack, lane, size, root))
-        if inverse[0, 0] > real(0.0):
-            factor = wp.transpose(inverse * back)
-            for p in range(entry[1] + 1):
-                place = entry[3] + p * wide + entry[1]
-                store(lower_out, w, place, wide * wide, block(lower_out, w, place, wide * wide) * factor)
-        restore(a_out, root_in, pack, lane, part, root)
-
-    return SimpleNamespace(place_masses=place_masses, mend_panel=mend_panel)
+    return SimpleNamespace(mark=mark, mend_root=mend_root, residual=residual, balance=balance)
