@@ -46,6 +46,8 @@ def solution_of(system: System) -> list[wp.array]:
         kept.append(w.delassus.real)
     if is_bounded or system.options.refinement > 0:
         kept.append(w.a.real)
+    if system.free is not None:
+        kept.append(system.free.excess.real)
     return kept if system.contact is None else [*kept, *contact_solution(system.contact)]
 
 
@@ -306,8 +308,7 @@ class StepAdjoint:
                 rows.into_sides()
             s.add(self.seed, y, s.dof_rows)
         else:
-            inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
-            s.each(system.k.residual, s.variant.parts(m.dof_count), inputs, [y.S])
+            system.residual(self.seed, self.p, y)
             if count:
                 inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -h]
                 s.each(rows.k.row_force, m.dof_count, inputs, [y.S])
@@ -347,8 +348,7 @@ class StepAdjoint:
         """p += A^-1 (seed - A p - h H' q)."""
         system, s, m, w, y = self.system, self.shard, self.model, self.shard.work, self.system.linear.y
         if not first:  # else the seed is there
-            inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, self.seed.S, self.p.S]
-            s.each(system.k.residual, s.variant.parts(m.dof_count), inputs, [y.S])
+            system.residual(self.seed, self.p, y)
             inputs = [m.dof_entry_start, m.dof_entry, m.entry_row, m.dof_free, w.row.S, self.q.S, -self.h]
             s.each(system.rows.k.row_force, m.dof_count, inputs, [y.S])
         system.linear.forward(1)

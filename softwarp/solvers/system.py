@@ -18,6 +18,7 @@ from softwarp.model.model import Model
 from softwarp.model.resolution import resolved_sizes
 from softwarp.model.state import Control, Parameters, State
 from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.linear.free_bodies import FreeBodies, free_parts
 from softwarp.solvers.multipliers import BoundedMultipliers, ContactMultipliers, Multipliers, StaticRows
 from softwarp.solvers.options import Options
 from softwarp.solvers.terms.contact import ContactTerm
@@ -46,6 +47,7 @@ class System:
         work: Workspace.
         terms: Effects, in the order in which a step walks them.
         linear: Solver of ``A u = b``.
+        free: Bodies whose mass it must not lose, if the scene has any in float32 on a CPU.
         rows: Multiplier rows besides contacts.
         multipliers: Laws of all rows.
         watch: Called with the number of every pass of a linear solve, after it, where somebody wants to know.
@@ -68,10 +70,12 @@ class System:
         self.model, self.variant, self.options, self.index = model, variant, options, index
         self.shard = shard = Shard(model, variant, state, control, parameters, options, exact)
         self.state, self.work, self.world_count = state, shard.work, shard.world_count
-        sides = 1 + model.row_count + more_sides
+        parts = free_parts(model) if variant.real == wp.float32 and model.device == "cpu" else []
+        sides = max(1 + model.row_count + more_sides, 3 if parts else 1)
         worlds = (self.world_count, sides, model.device, options.gpu_path)
         contacts = 0 if model.contact is None else model.contact.capacity
         self.linear = LinearSolver(model.symbolic, index, variant, *worlds, contacts=contacts)
+        self.free = FreeBodies(shard, self.linear, parts) if parts else None
         self.k = assembly.kernels(variant)
         self.k_prescribed = prescribed.kernels(variant)
         nobody = [wp.empty(0, dtype=dtype, device=model.device) for dtype in (wp.int32, variant.real)]
@@ -306,7 +310,7 @@ class System:
     def solve(self, f_scale: float, x_scale: float) -> None:
         """Unknowns ``u`` and multipliers of ``A u = b + f_scale H' multiplier`` with the rows' laws."""
         further = self.multipliers.further
-        self.linear.factor(self.work.a)
+        self.factor()
         for correction in range(1 + self.passes):
             if further is not None and correction == self.passes:
                 further.mark()
@@ -318,17 +322,33 @@ class System:
                 further.take(look, always=self.always)
             further.end()
 
+    def factor(self) -> None:
+        """Factorise A, so that free bodies keep their mass in it."""
+        a = self.work.a
+        if self.free is not None and self.h > 0.0:
+            self.free.mark(a)
+        self.linear.factor(a)
+        if self.free is not None and self.h > 0.0:
+            self.free.mend(a)
+
+    def residual(self, b: Rows, u: Rows, y: Rows) -> None:
+        """y = b - A u, for iterative refinement; needs ``factor``."""
+        s, m, w = self.shard, self.model, self.work
+        inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, b.S, u.S]
+        s.each(self.k.residual, s.variant.parts(m.dof_count), inputs, [y.S])
+        if self.free is not None and self.h > 0.0:
+            self.free.residual(w.a, b, u, y)
+
     def _pass(self, f_scale: float, x_scale: float, correction: int) -> None:
         """One pass of ``solve``: the first one, 0, or a correction of the unknowns so far."""
-        s, m, w, linear = self.shard, self.model, self.work, self.linear
+        s, w, linear = self.shard, self.work, self.linear
         if correction == 0:
             self.b_into_sides()
             self.start_unknowns()
         else:
             for term in self.terms:
                 term.correct(x_scale)
-            inputs = [m.neighbour_start, m.neighbour, m.neighbour_block, w.a.S, w.b.S, w.u.S]
-            s.each(self.k.residual, s.variant.parts(m.dof_count), inputs, [linear.y.S])
+            self.residual(w.b, w.u, linear.y)
         self.multipliers.respond(f_scale, x_scale, correction)
         if linear.panels is not None:
             linear.panels.backward(w.u)

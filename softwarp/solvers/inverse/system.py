@@ -69,7 +69,7 @@ class InverseSystem:
         s.forces()
         s.tangent()
         s.right_hand_side(h, inertia=o.momentum, moving=False)
-        s.linear.factor(work.a)
+        s.factor()
         s.b_into_sides()
         p.place_effectors()
         s.start_unknowns()
