@@ -127,7 +127,7 @@ def _structure(scene: Scene, parts: _Layouts) -> Structure:
         soft.nodes,
         soft.fixed,
         soft.locked,
-        [*soft_elements(soft), *parts.thin, *segment_elements(frames)],
+        [*soft_elements(soft, frames), *parts.thin, *segment_elements(frames)],
         parts.row_starts,
         parts.points,
         parts.joints.row_frames,
