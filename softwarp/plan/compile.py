@@ -165,7 +165,7 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         symbolic=found.symbolic,
         extent=extent,
         node_size=node_size(scene),
-        frames=frame_model(frames, found, len(scene.bodies), frame_sizes(scene, frames, extent)),
+        frames=frame_model(frames, found, len(scene.bodies), frame_sizes(scene, frames, extent), soft.quadratic.nodes),
         cavities=cavities,
         membranes=membrane_model(scene, parts.membranes, found),
         tractions=traction_model(scene, soft.node_start),
