@@ -25,10 +25,11 @@ from softwarp.envs.options.trunk import TrunkSceneConfig
 from softwarp.envs.scenes.catch_the_object import add_pad, build_catch_scene
 from softwarp.envs.scenes.diamond import EFFECTOR, build_diamond_scene, diamond_mesh
 from softwarp.envs.scenes.gripper import build_gripper_scene
-from softwarp.envs.scenes.tripod import SERVOS, build_tripod_scene, held_nodes, tripod_mesh
+from softwarp.envs.scenes.tripod import HEIGHT, SERVOS, build_tripod_scene, tripod_mesh, turn
 from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
 from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.finger_geometry import FLANGE
+from softwarp.meshing.tripod_geometry import HOLE_RADIUS, REACH, SIDE
 from softwarp.meshing.trunk_geometry import LENGTH
 
 from . import trunk
@@ -40,6 +41,10 @@ SOLID = WARPED | {"element": "p2"}
 DIAMOND_LOADS = ((0.0, 0.0, -5.0), (0.0, 0.0, 10.0), (5.0, 0.0, 0.0), (2.5, 2.5, -2.5))  # m/s^2
 # m, of the top under these: limits that ``fidelity_truth`` finds
 DIAMOND_WAYS = 1e-3 * np.array([[0.0, 0.0, -32.51], [0.0, 0.0, 27.70], [32.21, 0.0, -1.55], [16.92, 16.92, -13.14]])
+TRIPOD_LOADS = ((0.0, 0.0, -20.0), (0.0, 0.0, 20.0), (20.0, 0.0, -20.0))  # m/s^2
+# m, of the hole's rim under these: limits that ``fidelity_tripod`` finds
+TRIPOD_WAYS = 1e-3 * np.array([[0.0, -0.13, -4.86], [0.0, 0.25, 4.82], [0.26, -0.13, -4.86]])
+TRIPOD_HELD = SIDE + (REACH - SIDE) * 5.0 / 6.0  # m, from the axis: the line from which arms hold the coarse mesh
 
 
 @dataclass(frozen=True)
@@ -122,16 +127,19 @@ def _diamond(options: Options) -> tuple[Floats, Floats]:
     return weighed(diamond_mesh(config), config, config.total_mass, held, EFFECTOR, DIAMOND_LOADS, stiffness)
 
 
-def _tripod(options: Options) -> tuple[Floats, Floats]:
-    config = TripodSceneConfig(**options)
-    mesh = tripod_mesh(config)
+def hang_tripod(mesh: Any, config: TripodSceneConfig, loads: Sequence[Sequence[float]]) -> tuple[Floats, Floats]:
+    """A point of the hole's rim, as ``weighed``; every mesh is held from the same line on, whatever nodes it has."""
 
     def held(x: Floats) -> NDArray[np.bool_]:
-        return np.isin(np.arange(len(x)), np.concatenate([held_nodes(config, x, servo) for servo in range(SERVOS)]))
+        along = [(x @ turn(servo))[:, 1] for servo in range(SERVOS)]
+        return np.asarray(np.max(along, axis=0) > TRIPOD_HELD - 1.0e-6)
 
-    gravity = ((0.0, 0.0, -20.0), (0.0, 0.0, 20.0), (20.0, 0.0, -20.0))
-    point = (0.0, 0.0, float(mesh.nodes[:, 2].max()))
-    return weighed(mesh, config, config.total_mass, held, point, gravity)
+    return weighed(mesh, config, config.total_mass, held, (0.0, HOLE_RADIUS, HEIGHT), loads)
+
+
+def _tripod(options: Options) -> tuple[Floats, Floats]:
+    config = TripodSceneConfig(**options)
+    return hang_tripod(tripod_mesh(config), config, TRIPOD_LOADS)
 
 
 def _finger(options: Options) -> tuple[Floats, Floats]:
@@ -203,8 +211,8 @@ ROBOTS = {
     "Tripod": Robot(
         lambda options, builder: build_tripod_scene(TripodSceneConfig(**options), builder),
         _tripod,
-        {"mesh": "medium", **SOLID},
-        {"default": {}, "p2": SOLID},
+        TRIPOD_WAYS,
+        {"default": {}, "fine": {"mesh": "fine", **WARPED, "lumping": "volume"}, "p2": SOLID},
     ),
     "CatchTheObject": Robot(
         lambda options, builder: build_catch_scene(CatchSceneConfig(**options), builder),

@@ -78,6 +78,14 @@ TURNED = ("large", "warped")  # laws that keep turned gradients for their stiffn
 
 
 # Frames
+class Side(IntEnum):
+    """What stands on one side of a block of A with a quadratic element that frames carry nodes of."""
+
+    NODE = 0  # a free node
+    TRANSLATION = 1  # of a frame
+    ROTATION = 2
+
+
 class Spin(IntEnum):
     """How a master moves on with its momentum: not at all, as a frame alone, as a compound, as a free top."""
 

@@ -82,11 +82,22 @@ class FrameModel:
     seg_entry_start: wp.array = shared("block", doc="ranges in seg_entry, (block + 1,)")
     seg_entry: wp.array = shared("entry", doc="16 segment + 4 a + b: segment blocks in a block of A")
     kinematic_frame: wp.array = shared("kinematic", doc="frames of kinematic bodies")
+    grip_start: wp.array = shared("grip", doc="ranges in grip_corner: what a frame carries of a quadratic element")
+    grip_corner: wp.array = shared("gripped corner", doc="10 element + node")
+    grip_item: wp.array = shared("gripped corner", doc="carried item of that node")
+    gripped_block: wp.array = shared("gripped block", doc="blocks of A with such elements")
+    gripped_start: wp.array = shared("gripped block", doc="ranges in gripped_entry")
+    gripped_entry: wp.array = shared("entry", doc="element, codes of the row's and the column's side; (entry, 3)")
 
     @property
     def rod_node_count(self) -> int:
         """Nodes of all rods."""
         return int(self.rod_start[-1])
+
+    @property
+    def grip_count(self) -> int:
+        """Pairs of a frame and a quadratic element of which it carries nodes, but not all."""
+        return int(self.grip_start.size) - 1
 
     @property
     def carried_count(self) -> int:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from softwarp.model.frames import FrameModel
 from softwarp.model.structure import GatherLists, Symbolic
 from softwarp.plan.frames import FrameLayout
+from softwarp.plan.grips import KIND, grip_lists
 from softwarp.plan.quadratic import carried_blocks, held_nodes
 from softwarp.plan.structure import Elements, Slots, Structure, block_of, lists
 
@@ -17,7 +18,9 @@ IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 
 
-def frame_model(f: FrameLayout | None, found: Structure, bodies: int, size: FloatArray) -> FrameModel | None:
+def frame_model(
+    f: FrameLayout | None, found: Structure, bodies: int, size: FloatArray, elements: IntArray
+) -> FrameModel | None:
     """Frames in elimination order; None without any.
 
     Args:
@@ -25,6 +28,7 @@ def frame_model(f: FrameLayout | None, found: Structure, bodies: int, size: Floa
         found: Structure of the linear system.
         bodies: Soft bodies, whose rows come before those of rods and rigid bodies in the workspace's body arrays.
         size: Sizes of the frames' parts, from ``plan.resolution`` [m], (frame,).
+        elements: Nodes of quadratic elements, (element, 10).
     """
     if f is None:
         return None
@@ -82,6 +86,7 @@ def frame_model(f: FrameLayout | None, found: Structure, bodies: int, size: Floa
         seg_entry_start=found.lists["segment"].start,
         seg_entry=found.lists["segment"].entry,
         kinematic_frame=np.flatnonzero(f.is_kinematic),
+        **vars(grip_lists(found, f, elements)),
     )
 
 
@@ -100,14 +105,17 @@ def segment_elements(f: FrameLayout | None) -> list[Elements]:
 
 
 def _carried_elements(found: Structure) -> tuple[dict[str, GatherLists], dict[str, GatherLists]]:
-    """Blocks of A and nodes that elements with carried nodes give to, by kind; membranes look after theirs."""
+    """Blocks of A and nodes that elements with carried nodes give to, by kind.
+
+    Membranes look after theirs, and the blocks of turned quadratic elements are those of grips.
+    """
     carried: dict[str, GatherLists] = {}
     held: dict[str, GatherLists] = {}
     for kind, lists_of in found.lists.items():
         if kind == "membrane":
             continue
         is_quadratic = kind in ("quadraticlarge", "quadraticstored")
-        if lists_of.carried.target.size:
+        if lists_of.carried.target.size and kind != KIND:
             carried[kind] = carried_blocks(lists_of.carried) if is_quadratic else lists_of.carried
         if lists_of.held.target.size:
             held[kind] = held_nodes(lists_of.held) if is_quadratic else lists_of.held

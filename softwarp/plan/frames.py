@@ -93,6 +93,11 @@ class FrameLayout:
         """Nodes, then translations and rotations of frames."""
         return self.node_count + 2 * self.count
 
+    def carries_whole(self, corners: IntArray) -> NDArray[np.bool_]:
+        """Whether one frame carries all nodes of elements (element, corner)."""
+        frame = self.node_frame[corners]
+        return np.asarray((frame[:, 0] >= 0) & (frame == frame[:, :1]).all(axis=1))
+
     def inertia_in_master(self) -> FloatArray:
         """Inertia of every frame in the axes of its master, (frame, 3, 3)."""
         turns = np.array([rotation_matrix(q) for q in self.offset[:, 3:]]).reshape(-1, 3, 3)

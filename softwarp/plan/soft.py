@@ -13,7 +13,7 @@ from softwarp import meshing
 from softwarp.meshing.tets import rest_geometry
 from softwarp.model.codes import TURNED
 from softwarp.model.quadratic import QuadraticLayout
-from softwarp.plan.frames import guide_points
+from softwarp.plan.frames import FrameLayout, guide_points
 from softwarp.plan.quadratic import by_law, quadratic_elements, quadratic_layout
 from softwarp.plan.structure import Elements, lists
 from softwarp.scene.parts import BodySpec, Scene
@@ -117,9 +117,14 @@ def tet_elements(tets: IntArray, is_turned: NDArray[np.bool_]) -> list[Elements]
     ]
 
 
-def soft_elements(soft: SoftLayout) -> list[Elements]:
-    """Linear and quadratic tets of all bodies."""
-    return tet_elements(soft.tets, np.isin(soft.laws, TURNED)) + quadratic_elements(soft.quadratic)
+def soft_elements(soft: SoftLayout, frames: FrameLayout | None) -> list[Elements]:
+    """Linear and quadratic tets of all bodies, less those that one frame carries whole.
+
+    These move as rigid bodies, against which an element has no stiffness: what they would add to A is zero. Forces,
+    energies, stresses and masses are theirs as before.
+    """
+    parts = tet_elements(soft.tets, np.isin(soft.laws, TURNED)) + quadratic_elements(soft.quadratic)
+    return parts if frames is None else [part.chosen(~frames.carries_whole(part.corners)) for part in parts]
 
 
 def stacked(parts: list[NDArray[Any]], empty: tuple[int, ...], dtype: Any) -> NDArray[Any]:

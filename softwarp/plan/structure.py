@@ -142,6 +142,10 @@ class Elements:
     corners: IntArray
     number: NDArray[Any]
 
+    def chosen(self, keep: NDArray[np.bool_]) -> Elements:
+        """Some of them; their numbers stay."""
+        return Elements(self.kind, self.corners[keep], self.number[keep])
+
 
 @dataclass(frozen=True)
 class Points:

@@ -13,6 +13,7 @@ import torch
 
 import softwarp as sw
 from softwarp import meshing
+from softwarp.plan.frames import FrameLayout
 from tests import cases
 from tests import rod_cases as rods
 from tests.rigid_cases import spinning, vector
@@ -189,3 +190,88 @@ def test_written_velocities_reach_what_is_carried() -> None:
     body.body_twist[0, 0, 0] = 3.0
     body.step()
     assert float(body.body_pose[0, 0, 0]) == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("element", ["p1", "p2"])
+@pytest.mark.parametrize("law", ["large", "nh_log"])
+def test_elements_gripped_whole_add_nothing(law: str, element: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar that two bodies grip moves, strains and weighs as with the stiffness of what they grip."""
+
+    def swing(*, gripped: bool) -> tuple[sw.Simulation, list[torch.Tensor]]:
+        if gripped:
+            monkeypatch.setattr(FrameLayout, "carries_whole", lambda self, corners: np.zeros(len(corners), dtype=bool))
+        builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+        bar = builder.add_tets(
+            meshing.box((0.06, 0.01, 0.01), (6, 1, 1)), material=cases.material(law, 1.0e5, 0.4), element=element,
+            density=1000.0, rayleigh=(0.0, 0.01),
+        )  # fmt: skip
+        x = builder.bodies[bar].mesh.nodes[:, 0]
+        hand = builder.add_rigid(kinematic=True)
+        tip = builder.add_rigid(sw.Box((0.02, 0.01, 0.01)), mass=0.01, pose=(0.05, 0.005, 0.005, 0, 0, 0, 1))
+        builder.attach(bar, np.flatnonzero(x < 0.0201), to=hand)
+        builder.attach(bar, np.flatnonzero(x > 0.0399), to=tip)
+        sim = sw.Simulation(builder.finalize(1, "cpu", "float64"), newton_iterations=2)
+        found = []
+        for step in range(10):
+            sim.control.body_pose[:, hand, 2] = 0.001 * step
+            sim.step()
+            measured = (sim.node_x, sim.body_pose, sim.energy(), sim.element_stress())
+            found += [value.clone() for value in measured]
+        return sim, found
+
+    sim, without = swing(gripped=False)
+    reference, whole = swing(gripped=True)
+    for found, expected in zip(without, whole, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+    frames = (sim.model.frames, reference.model.frames)
+    entries = [sum(lists[2].shape[0] for lists in f.carried_blocks.values()) + f.gripped_entry.shape[0] for f in frames]
+    assert entries[0] < (0.5 if element == "p1" else 0.95) * entries[1]
+
+
+def test_body_gripped_whole() -> None:
+    """A soft body that a rigid one carries as a whole falls with it, has no stress and keeps its mass."""
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
+    block = builder.add_tets(
+        meshing.box((0.02, 0.02, 0.02), (1, 1, 1)), material=sw.Corotational(1e5, 0.3), density=1e3
+    )
+    crate = builder.add_rigid(sw.Box((0.02, 0.02, 0.02)), mass=0.01, pose=(0.01, 0.01, 0.01, 0, 0, 0, 1))
+    builder.attach(block, np.arange(8), to=crate)
+    sim = sw.Simulation(builder.finalize(1, "cpu", "float64"))
+    start = sim.node_x.clone()
+    for _ in range(10):
+        sim.step()
+    fall = (sim.node_x - start).mean(dim=1)[0]
+    assert fall.tolist() == pytest.approx([0.0, 0.0, -9.81 * 1e-4 * 55], abs=1e-12)
+    assert float(sim.element_stress().abs().max()) < 1e-6
+
+
+@pytest.mark.parametrize("cells", [1, 3])
+def test_grips_of_quadratic_elements(cells: int) -> None:
+    """From rest, sums over what frames carry give the step that blocks of every pair of nodes give, of a stored law.
+
+    Elements of a bar of one cell are carried by two frames, whose rotations they couple.
+    """
+    found = []
+    for method in ("warped", "large", "polar"):
+        builder = sw.ModelBuilder(gravity=(1.0, -2.0, -9.81))
+        bar = builder.add_tets(
+            meshing.box((0.01 * cells, 0.01, 0.012), (cells, 1, 1)),
+            material=sw.Corotational(1.0e5, 0.4, method=method),
+            element="p2",
+            density=1000.0,
+            rayleigh=(0.0, 0.02),
+        )
+        x = builder.bodies[bar].mesh.nodes[:, 0]
+        ends = []
+        for place, held in ((0.0, x < 1e-6), (0.01 * cells, x > 0.01 * cells - 1e-6)):
+            pose = (place, 0.02, -0.01, 0.0, 0.0, 0.0, 1.0)
+            ends.append(builder.add_rigid(sw.Box((0.01, 0.02, 0.01)), mass=0.01, pose=pose))
+            builder.attach(bar, np.flatnonzero(held), to=ends[-1])
+        sim = sw.Simulation(builder.finalize(1, "cpu", "float64"))
+        assert (sim.model.frames.grip_count > 0) == (method != "polar")
+        sim.control.body_force[0, ends[0]] = vector(0.1, -0.2, 0.05, 1e-3, 2e-3, -3e-3)
+        sim.step()
+        found.append(torch.cat([sim.node_v.flatten(), sim.body_twist.flatten()]))
+    scale = float(found[2].abs().max())
+    assert float((found[0] - found[2]).abs().max()) < 1e-10 * scale
+    assert float((found[1] - found[2]).abs().max()) < 1e-10 * scale

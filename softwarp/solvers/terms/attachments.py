@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from softwarp.kernels.elements import attachment, quadratic
+from softwarp.kernels.elements import attachment, grip, quadratic
 from softwarp.model.frames import FrameModel
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
@@ -80,6 +80,7 @@ class AttachmentTerm(Term):
         super().__init__(shard)
         self.model = model
         self.k = attachment.kernels(shard.variant)
+        self.k_grip = grip.kernels(shard.variant)
         self.k_quadratic = quadratic.kernels(shard.variant)
         self.blocks = [self._kind(kind, lists) for kind, lists in model.carried_blocks.items()]
         self.held = [self._kind(kind, lists) for kind, lists in model.held_nodes.items()]
@@ -105,6 +106,18 @@ class AttachmentTerm(Term):
                 inputs, kernel = [*inputs, w.body_mu.S, w.body_lam.S], self.k.turned_stiffness
             inputs += [w.body_stiffness.S, kind.kept.S, w.lever.S]
             s.each(kernel, kind.lists[0].size, inputs, [w.a.S])
+        self._add_grips()
+
+    def _add_grips(self) -> None:
+        """Stiffness of turned quadratic elements whose nodes frames carry; needs their shape gradients."""
+        s, m, w, second = self.shard, self.model, self.shard.work, self.shard.model.quadratic
+        if second is None or m.grip_count == 0:
+            return
+        inputs = [m.grip_start, m.grip_corner, m.grip_item, w.gauss_shape.S, w.lever.S]
+        s.each(self.k_grip.gather, m.grip_count, inputs, [w.grip.S])
+        inputs = [second.point_body, m.gripped_block, m.gripped_start, m.gripped_entry, w.body_mu.S, w.body_lam.S]
+        inputs += [w.body_stiffness.S, w.gauss_shape.S, w.grip.S]
+        s.each(self.k_grip.stiffness, m.gripped_block.size, inputs, [w.a.S])
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
         """Beta K v at carried nodes as internal forces; needs the velocities of slots.

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import corotational, norms, quadratic, samples, tensor_sums, turning
+from softwarp.kernels.elements import corotational, grip, norms, quadratic, samples, tensor_sums, turning
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.frames.tube_section import LAW_ROWS, PLAN_ROWS
 from softwarp.kernels.frames.windup import SYSTEM_ROWS
@@ -93,6 +93,7 @@ class Workspace:
     gauss_force: Rows = scratch("Gauss point", 12, unit="N", doc="dE/dx of these corners")
     gauss_gradient: Rows = scratch("turned Gauss point", corotational.TURNED_ROWS, doc="their turned gradients")
     gauss_shape: Rows = scratch("turned Gauss point", 30, doc="turned gradients of the ten nodes' shape functions")
+    grip: Rows = scratch("grip", grip.ROWS, doc="sums of these and of their moments over nodes that a frame carries")
     gauss_stiffness: Rows = scratch("stored Gauss point", 90, unit="N/m", doc="ten blocks of its linear tet")
     segment_force: Rows = scratch("segment", 12, unit="N", doc="force and moment [N m] of a rod segment on its ends")
     segment_damping: Rows = scratch("segment", 12, unit="N", doc="the same from beta K v")
@@ -312,6 +313,7 @@ def counts(model: Model, exact: bool) -> dict[str, int]:
         "telescope segment": model.items("telescope segment"),
         "slot": 0 if frames is None else int(frames.slot_dof.size),
         "carried": 0 if frames is None else frames.carried_count,
+        "grip": 0 if frames is None else frames.grip_count,
         "row point": len(model.point_node),
         "coupled point": model.point_count if model.coupling_point.size else 0,
         "entry": int(model.entry_dof.size),
