@@ -6,7 +6,14 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.elements import adjoint as of_tets
-from softwarp.kernels.elements import adjoint_sums, floating_adjoint, floating_pull, membrane_adjoint, samples
+from softwarp.kernels.elements import (
+    adjoint_sums,
+    floating_adjoint,
+    floating_moment_adjoint,
+    floating_pull,
+    membrane_adjoint,
+    samples,
+)
 from softwarp.model.floating import FloatingModel
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
@@ -83,6 +90,7 @@ class FloatingAdjoint:
         self.model: FloatingModel = term.model.floating
         m, nodes = self.model, shard.model.node_count
         self.k, self.k_pull = floating_adjoint.kernels(shard.variant), floating_pull.kernels(shard.variant)
+        self.k_moment = floating_moment_adjoint.kernels(shard.variant)
         self.k_sums = adjoint_sums.kernels(shard.variant)
         self.start, self.end = Places(shard, term, m), Places(shard, term, m)
         moments = 9 * int(m.moment_body.size)
@@ -179,11 +187,11 @@ class FloatingAdjoint:
         s, m = self.shard, self.model
         if not s.variant.world_fastest:
             inputs = [s.lanes, m.moment_start, m.moment_first, m.moment_stride, m.moments, m.first, m.modes]
-            s.each_real(self.k.body_moment_bars, m.count, [*inputs, moment_bar.real, mode_bar.real], [bar])
+            s.each_real(self.k_moment.body_moment_bars, m.count, [*inputs, moment_bar.real, mode_bar.real], [bar])
             return
         inputs = [s.lanes, m.moment_body, m.moment_start, m.moment_first, m.moment_stride, m.moments]
         inputs += [m.first, m.modes, moment_bar.real, mode_bar.real]
-        s.each_real(self.k.moment_bars, int(m.moment_body.size), inputs, [bar])
+        s.each_real(self.k_moment.moment_bars, int(m.moment_body.size), inputs, [bar])
 
     def place(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
         """Velocities and p of nodes, from what modes have in the axes of their bodies."""
