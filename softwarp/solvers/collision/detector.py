@@ -125,7 +125,7 @@ class Detector:
         self.k_near = None if self.k_sift is None else sift_shapes.kernels(variant.lanes)
         self.k_box = box_features.kernels() if self.k_near is not None and variant.lanes > 1 else None
         self.k_strike = strike.kernels(variant)
-        self.k_keep = keeping.kernels(variant) if steady else None
+        self.k_keep: Any = keeping.kernels(variant) if steady else None
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
         self.contacts = contact_list.allocate(variant, world_count, capacity, device)
