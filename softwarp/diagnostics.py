@@ -122,9 +122,10 @@ def _membrane_energy(model: Model, state: State, parameters: Parameters) -> torc
     """Plane-stress St. Venant-Kirchhoff energy of all membranes [J], shape (world,)."""
     import torch
 
-    m, x, p = model.membranes, interop.views(state, model)["node_x"], interop.views(parameters, model)
+    m = model.membranes
     if m is None:
         return _none(model)
+    x, p = interop.named_view(state, model, "node_x"), interop.views(parameters, model)
     tri = wp.to_torch(m.tri_node).long()
     edges = x[:, tri[:, 1:]] - x[:, tri[:, :1]]  # (world, tri, 2, 3)
     gradient = wp.to_torch(m.tri_gradient).unflatten(1, (2, 2))  # (tri, corner, axis)
@@ -153,8 +154,8 @@ def _frame_density(model: Model, parameters: Parameters) -> torch.Tensor:
     import torch
 
     assert model.frames is not None
-    p = interop.views(parameters, model)
-    density: torch.Tensor = torch.cat([p["body_mass"], p["rod_density"]], dim=1)
+    held = [interop.named_view(parameters, model, name) for name in ("body_mass", "rod_density")]
+    density = torch.cat(held, dim=1)
     return density[:, wp.to_torch(model.frames.frame_owner).long()]
 
 
@@ -210,7 +211,7 @@ def _node_momentum(model: Model, state: State, parameters: Parameters, mass: tor
     """M v of all nodes [N s], shape (world, node, 3); the mass of quadratic tets is not diagonal."""
     import torch
 
-    q, v = model.quadratic, interop.views(state, model)["node_v"]
+    q, v = model.quadratic, interop.named_view(state, model, "node_v")
     result: torch.Tensor = mass[..., None] * v
     if q is None:
         return result
@@ -235,7 +236,7 @@ def _node_weight(model: Model, parameters: Parameters, mass: torch.Tensor) -> to
 
 def _node_density(model: Model, parameters: Parameters, node: torch.Tensor) -> torch.Tensor:
     """Density of the bodies that some nodes belong to [kg/m^3], shape (world, node)."""
-    density: torch.Tensor = interop.views(parameters, model)["density"]
+    density = interop.named_view(parameters, model, "density")
     return density[:, wp.to_torch(model.node_body).long()[node]]
 
 
@@ -244,17 +245,17 @@ def _spin_momentum(model: Model, state: State, parameters: Parameters) -> torch.
     import torch
 
     assert model.frames is not None
-    view = interop.views(state, model)
+    pose, twist = (interop.named_view(state, model, name) for name in ("frame_pose", "frame_twist"))
     six = wp.to_torch(model.frames.frame_inertia)
     inertia = torch.stack([six[:, k] for k in (0, 3, 4, 3, 1, 5, 4, 5, 2)], dim=1).unflatten(1, (3, 3))
-    u, s = view["frame_pose"][..., 3:6], view["frame_pose"][..., 6:]
+    u, s = pose[..., 3:6], pose[..., 6:]
 
     def turned(v: torch.Tensor, sign: float) -> torch.Tensor:
         twice = 2.0 * torch.linalg.cross(sign * u, v)
         result: torch.Tensor = v + s * twice + torch.linalg.cross(sign * u, twice)
         return result
 
-    body = torch.einsum("fij,wfj->wfi", inertia, turned(view["frame_twist"][..., 3:], -1.0))
+    body = torch.einsum("fij,wfj->wfi", inertia, turned(twist[..., 3:], -1.0))
     return turned(_frame_density(model, parameters)[..., None] * body, 1.0)
 
 

@@ -11,7 +11,7 @@ import warp as wp
 
 from softwarp import checks
 from softwarp.advice import close_to
-from softwarp.model.fields import declarations
+from softwarp.model.fields import Declaration, declarations
 from softwarp.model.model import Model
 from softwarp.threads import alone, check_gpu
 
@@ -33,16 +33,20 @@ def view(array: wp.array, items: int, width: int) -> torch.Tensor:
 
 def views(container: Any, model: Model) -> dict[str, torch.Tensor]:
     """Views of every array of a container; quantities of a world drop their item axis."""
-    result = {}
-    for name, declaration in declarations(container).items():
-        items, width = model.items(declaration["item"]), declaration["width"]
-        if declaration["item"] == "world":
-            result[name] = view(getattr(container, name), width, 1)
-            if width == 1:
-                result[name] = result[name][:, 0]
-        else:
-            result[name] = view(getattr(container, name), items, width)
-    return result
+    return {name: _declared_view(container, model, name, each) for name, each in declarations(container).items()}
+
+
+def named_view(container: Any, model: Model, name: str) -> torch.Tensor:
+    """The view of one array of a container."""
+    return _declared_view(container, model, name, declarations(container)[name])
+
+
+def _declared_view(container: Any, model: Model, name: str, declaration: Declaration) -> torch.Tensor:
+    items, width = model.items(declaration["item"]), declaration["width"]
+    if declaration["item"] != "world":
+        return view(getattr(container, name), items, width)
+    found = view(getattr(container, name), width, 1)
+    return found[:, 0] if width == 1 else found
 
 
 def frame_aliases(views: dict[str, torch.Tensor], model: Model, pose: str, twist: str) -> dict[str, torch.Tensor]:

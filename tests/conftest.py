@@ -8,11 +8,11 @@ import gc
 import os
 from typing import Any
 
-import numpy as np
-import pytest
-
 os.environ.setdefault("MPLBACKEND", "Agg")
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # Torch's threads would spin for a core that another process works on
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads would spin for a core that another process works on
+
+import numpy as np  # which reads the variable, as Torch does
+import pytest
 
 BESIDE = "test_cuda_compile.py"  # compiles for most of a minute what no other file needs
 MOST_PROCESSES = 8  # each holds up to 2 GB: Torch and the kernels of the tests it ran

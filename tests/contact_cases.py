@@ -1,5 +1,6 @@
 """Scenes of contact that several tests share: slopes, piles of boxes, blocks of tets. SI units, z up."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,17 @@ def turned(quaternion: tuple[float, ...], points: np.ndarray) -> np.ndarray:
     u, w = np.asarray(quaternion[:3]), quaternion[3]
     twice = 2.0 * np.cross(u, points)
     return np.asarray(points + w * twice + np.cross(u, twice))
+
+
+@functools.cache
+def grid(size: tuple[float, float, float], spacing: float) -> sw.SDF:
+    """A box by distances on a grid, which take half a second: made by the first test that needs them."""
+    return sw.SDF.from_mesh(*sw.Box(size).surface(), spacing)
+
+
+def made(shape: Any) -> Any:
+    """A shape of a table, where those that take long are functions that make them."""
+    return shape() if callable(shape) else shape
 
 
 def pair(

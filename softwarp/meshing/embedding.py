@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks
 from softwarp.meshing.tets import FloatArray, IntArray, MeshError, boundary, bounding_box
+from softwarp.remembered import Remembered
 
+_before: Remembered[tuple[IntArray, FloatArray]] = Remembered(64)
 ROUNDING = 1e-9  # negative weight that still counts as inside: rounding on a face shared by two tetrahedra
 
 
@@ -53,7 +55,11 @@ def embed(
         raise MeshError(f"{name}: point {broken[0]} is not finite: {p[broken[0]].tolist()}; give a position in metres")
     low, high = bounding_box(x)
     allowed = max(float(np.linalg.norm(high - low)) * 1e-6 if tolerance is None else tolerance, snap)
+    index, weights = _before(lambda: _embed(x, t, p, allowed, name), x, t, p, allowed)
+    return index.copy(), weights.copy()
 
+
+def _embed(x: FloatArray, t: NDArray[Any], p: FloatArray, allowed: float, name: str) -> tuple[IntArray, FloatArray]:
     index, weights = np.zeros(len(p), dtype=np.int32), np.full((len(p), 4), -1.0)
     if len(p):
         point, near = _boxes_with(x[t], p, allowed)

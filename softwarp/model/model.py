@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -366,36 +366,48 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
 
     def items(self, name: str) -> int:
         """Number of items of a declared kind, such as ``node`` or ``cable``."""
-        counts = {
-            "node": self.node_count,
-            "body": self.body_count,
-            "law parameter": sum(map(len, self.law_parameters)),
-            "cable": self.cable_count,
-            "relaxing body": self.body_count if self.relaxes else 0,
-            "relaxing node": self.node_count if self.relaxes else 0,
-            "relaxing frame": self.frame_count if self.relaxes else 0,
-            "elastic cable": self.cable_count if self.cable_elastic.any() else 0,
-            "point": self.point_count,
-            "marker": self.marker_count,
-            "rigid": self.rigid_count,
-            "choice": sum(isinstance(shape, OneOf) for shape in self.rigid_shapes),
-            "rod": self.rod_count,
-            "cavity": self.cavity_count,
-            "membrane": self.membrane_count,
-            "traction": 0 if self.tractions is None else self.tractions.count,
-            "joint": self.joint_count,
-            "joint row": 0 if self.joints is None else self.joints.rows,
-            "pair": self.pair_count,
-            "contact": self.contact_capacity,
-            "frame": self.frame_count,
-            "mode": self.mode_count,
-            "floating": self.floating_count,
-            "telescope": 0 if self.telescopes is None else self.telescopes.count,
-            "tube": 0 if self.telescopes is None else self.telescopes.tube_count,
-            "windup": 0 if self.telescopes is None else self.telescopes.windup_count,
-            "telescope segment": 0 if self.telescopes is None else self.telescopes.piece_count,
-            "telescope node": 0 if self.telescopes is None else self.telescopes.node_count,
-            "varying segment": 0 if self.telescopes is None else self.segment_count,
-            "world": 1,
-        }
-        return counts[name]
+        return COUNTS[name](self)
+
+
+def _of(part: str, count: str) -> Callable[[Model], int]:
+    """Counts something of a part of the scene; 0 in scenes without that part."""
+
+    def counted(model: Model) -> int:
+        held = getattr(model, part)
+        return 0 if held is None else int(getattr(held, count))
+
+    return counted
+
+
+COUNTS: dict[str, Callable[[Model], int]] = {  # items of each declared kind
+    "node": lambda model: model.node_count,
+    "body": lambda model: model.body_count,
+    "law parameter": lambda model: sum(map(len, model.law_parameters)),
+    "cable": lambda model: model.cable_count,
+    "relaxing body": lambda model: model.body_count if model.relaxes else 0,
+    "relaxing node": lambda model: model.node_count if model.relaxes else 0,
+    "relaxing frame": lambda model: model.frame_count if model.relaxes else 0,
+    "elastic cable": lambda model: model.cable_count if model.cable_elastic.any() else 0,
+    "point": lambda model: model.point_count,
+    "marker": lambda model: model.marker_count,
+    "rigid": lambda model: model.rigid_count,
+    "choice": lambda model: sum(isinstance(shape, OneOf) for shape in model.rigid_shapes),
+    "rod": lambda model: model.rod_count,
+    "cavity": lambda model: model.cavity_count,
+    "membrane": lambda model: model.membrane_count,
+    "traction": _of("tractions", "count"),
+    "joint": lambda model: model.joint_count,
+    "joint row": _of("joints", "rows"),
+    "pair": lambda model: model.pair_count,
+    "contact": lambda model: model.contact_capacity,
+    "frame": lambda model: model.frame_count,
+    "mode": lambda model: model.mode_count,
+    "floating": lambda model: model.floating_count,
+    "telescope": _of("telescopes", "count"),
+    "tube": _of("telescopes", "tube_count"),
+    "windup": _of("telescopes", "windup_count"),
+    "telescope segment": _of("telescopes", "piece_count"),
+    "telescope node": _of("telescopes", "node_count"),
+    "varying segment": lambda model: 0 if model.telescopes is None else model.segment_count,
+    "world": lambda model: 1,
+}

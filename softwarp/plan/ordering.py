@@ -7,6 +7,8 @@ list of 3x3 block operations: no search, no pivoting, no branch on data. Theory:
 from __future__ import annotations
 
 import hashlib
+import threading
+from collections import OrderedDict
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
@@ -33,6 +35,9 @@ FINALISTS = 10  # cuts with the fewest blocks along them, whose separators are f
 
 # Structures that models hold, by what they follow from: the same scene with other worlds or precision shares its own.
 _analyzed: WeakValueDictionary[bytes, Symbolic] = WeakValueDictionary()
+_recent: OrderedDict[bytes, Symbolic] = OrderedDict()  # the latest ones stay for scenes that are built again
+_lock = threading.Lock()
+MOST_RECENT = 1 << 26  # bytes of their arrays
 
 
 def analyze(
@@ -61,13 +66,23 @@ def analyze(
     """
     edges = _unique_edges(edges)
     places = None if points is None else np.asarray(points, dtype=np.float64)
-    digest = hashlib.sha256(repr((count, contacts, edges.shape, points is None)).encode() + edges.tobytes())
-    digest.update(b"" if places is None else places.tobytes())
-    digest.update(b"" if touch is None else touch.tobytes())
-    found = _analyzed.get(digest.digest())
+    given = hashlib.sha256(repr((count, contacts, edges.shape, points is None)).encode() + edges.tobytes())
+    given.update(b"" if places is None else places.tobytes())
+    given.update(b"" if touch is None else touch.tobytes())
+    digest = given.digest()
+    found = _analyzed.get(digest)
     if found is None:
-        found = _analyzed[digest.digest()] = _analyze(edges, count, places, contacts, touch)
+        found = _analyzed[digest] = _analyze(edges, count, places, contacts, touch)
+    with _lock:
+        _recent[digest] = found
+        _recent.move_to_end(digest)
+        while sum(map(_bytes, _recent.values())) > MOST_RECENT:
+            _recent.popitem(last=False)
     return found
+
+
+def _bytes(symbolic: Symbolic) -> int:
+    return sum(array.nbytes for array in vars(symbolic).values() if isinstance(array, np.ndarray))
 
 
 def _analyze(

@@ -17,12 +17,14 @@ from softwarp.plan.floating import TURNING, Frame, floating_frame, floating_mode
 from softwarp.plan.patches import chunks
 from softwarp.plan.soft import SoftArrays, SoftLayout
 from softwarp.plan.structure import ModeBlocks, Points, Structure, block_of
+from softwarp.remembered import Remembered
 from softwarp.scene.parts import ReductionSpec, Scene
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 BLOCK = 3  # modes
 TET, TRI = 5, 4  # numbers of an element of a chunk: itself, and its corners
+_masses: Remembered[FloatArray] = Remembered(4)
 LANE = 16  # numbers that registers of a CPU hold; strides are multiples of it
 
 
@@ -111,8 +113,8 @@ class _Body:
     def mass(self, volume: FloatArray) -> FloatArray:
         """Mass per density of the modes, (mode, mode)."""
         if self.inertia is None:
-            own = self._lumped(volume)
-            return np.asarray(np.einsum("inc,n,jnc->ij", self.moving, own, self.moving, optimize=True))
+            u, own = self.moving, self._lumped(volume)
+            return _masses(lambda: np.einsum("inc,n,jnc->ij", u, own, u, optimize=True), u, own).copy()
         return np.asarray(sum(u @ (self.inertia @ u.T) for u in np.moveaxis(self.moving, 2, 0)))
 
     def volume(self, volume: FloatArray) -> float:

@@ -19,6 +19,7 @@ from softwarp.io.atomic import atomic_path
 from softwarp.io.bounded import DamagedFileError, parse_json, read_arrays
 from softwarp.reduction.basis import deforming
 from softwarp.reduction.packing import RESOLUTION, pack, unpack
+from softwarp.remembered import Remembered
 
 FORMAT = "softwarp.reduction"
 VERSION = 4  # 4: quadratic elements; 3: a floating frame; 2: packed modes, of a mesh that the file does not hold
@@ -34,6 +35,7 @@ Element = Literal["p1", "p2"]
 ELEMENTS: tuple[Element, ...] = ("p1", "p2")
 PIECES, POINTS = 8, 4  # linear tets between the nodes of a quadratic element, and its Gauss points
 _THIN = "membrane:"  # begins the names of membranes' weights in a file
+_before: Remembered[FloatArray] = Remembered(4)  # modes of compact files, and products of modes in mass
 
 
 class ReductionFileError(ValueError):
@@ -341,7 +343,8 @@ def _given(
 def _unpacked(arrays: Mapping[str, NDArray[Any]], nodes: FloatArray) -> FloatArray:
     """Modes of a compact file."""
     rigid, share = arrays["rigid_modes"].reshape(-1, *nodes.shape), arrays["share"]
-    return unpack(arrays["unit"], arrays["parity"], arrays["planes"], nodes, rigid, share)
+    given = arrays["unit"], arrays["parity"], arrays["planes"], nodes, rigid, share
+    return _before(lambda: unpack(*given), *given).copy()
 
 
 def _digest_of(about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -370,7 +373,7 @@ def _check_whole(
     share = arrays.get("share")
     if "digest" in about or share is None or share.shape != modes.shape[1:2]:
         return
-    products = np.einsum("inx,n,jnx->ij", modes, share, modes, optimize=True)
+    products = _before(lambda: np.einsum("inx,n,jnx->ij", modes, share, modes, optimize=True), modes, share)
     wrong = float(np.abs(products - np.eye(len(modes))).max())
     if not wrong <= ORTHONORMAL:
         raise _damaged(source, f"its modes are not orthonormal in mass, by {wrong:.2g}")

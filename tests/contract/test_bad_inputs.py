@@ -7,6 +7,7 @@ draws further values, the same ones in every run.
 
 import dataclasses
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.internal.conjecture import providers
 
 import softwarp as sw
 from softwarp import checks, control, diagnostics, gradients, identification, interop, meshing, reduction
@@ -33,6 +35,26 @@ FIXED = settings(derandomize=True, deadline=None, database=None, suppress_health
 
 SCENES, VALUES, OPTIONS, LIBRARY = scene_calls(), value_calls(), option_calls(), library_calls()
 ALL = [*SCENES, *VALUES, *OPTIONS, *LIBRARY]
+
+
+def drawn(examples: int = 100, **values: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Makes a test of a function whose arguments Hypothesis draws.
+
+    Hypothesis would mix in constants that it reads, for four seconds, in the source of whatever is loaded: other ones
+    in each process. Here it knows of none, and they are not read while tests are collected either.
+    """
+
+    def made(function: Callable[..., None]) -> Callable[..., None]:
+        told = settings(FIXED, max_examples=examples)(given(**values)(function))
+
+        def test(monkeypatch: pytest.MonkeyPatch) -> None:
+            monkeypatch.setattr(providers, "_get_local_constants", lambda: providers._local_constants, raising=False)
+            told()
+
+        test.__doc__ = function.__doc__
+        return test
+
+    return made
 
 
 def faults(call: Call) -> list[str]:
@@ -230,8 +252,7 @@ ANYTHING = st.one_of(
 )
 
 
-@FIXED
-@given(value=ANYTHING, low=st.floats(-1e6, 1e6), width=st.floats(0.0, 1e6))
+@drawn(value=ANYTHING, low=st.floats(-1e6, 1e6), width=st.floats(0.0, 1e6))
 def test_a_number_is_returned_as_it_is_or_refused(value, low, width):
     """What passes is the value as a float within its limits; what does not is named with its limits."""
     try:
@@ -244,8 +265,7 @@ def test_a_number_is_returned_as_it_is_or_refused(value, low, width):
         assert type(found) is float and found == value and low <= found <= low + width
 
 
-@FIXED
-@given(value=st.lists(st.integers(-(2**70), 2**70), min_size=1, max_size=6))
+@drawn(value=st.lists(st.integers(-(2**70), 2**70), min_size=1, max_size=6))
 def test_integers_keep_their_values_or_are_refused(value):
     """No cast wraps around."""
     try:
@@ -257,8 +277,7 @@ def test_integers_keep_their_values_or_are_refused(value):
         assert found.tolist() == value
 
 
-@settings(FIXED, max_examples=300)
-@given(data=st.data())
+@drawn(300, data=st.data())
 def test_accepted_options_are_finite(data):
     """Of any environment with any one option drawn: refused by name, or every number of it finite or without limit."""
     name = data.draw(st.sampled_from(registry.names()))
@@ -278,8 +297,7 @@ def test_accepted_options_are_finite(data):
     assert option in unlimited or all(math.isfinite(x) for x in flat if isinstance(x, float))
 
 
-@settings(FIXED, max_examples=300)
-@given(data=st.data())
+@drawn(300, data=st.data())
 def test_drawn_arguments_of_the_builder(data):
     """Any value in place of any argument: taken, or refused by softwarp itself."""
     call = data.draw(st.sampled_from(SCENES))

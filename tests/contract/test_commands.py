@@ -21,7 +21,7 @@ PAGES = sorted(
     for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     if path.parent.name != "tutorials"  # test_tutorials
 )
-BLOCK = re.compile(r"(?P<before>[^\n]*)\n+(?:<!-- (?P<note>[^\n]*?) -->\n)?^```bash\n(?P<body>.*?)^```$", re.M | re.S)
+BLOCK = re.compile(r"^(?P<before>[^\n]*)\n+(?:<!-- (?P<note>[^\n]*?) -->\n)?^```bash\n(?P<body>.*?)^```$", re.M | re.S)
 TIME = re.compile(r"\b(seconds?|minutes?|hours?|days?|\d+ (s|min|h))\b")
 INSTALLS = re.compile(r"(python3 -m venv|pip install)\b")
 

@@ -1,6 +1,7 @@
 """Rigid bodies in contact: Signorini's and Coulomb's laws, rolling, bouncing, stacks (catalogue 7.1 to 7.8, 7.13)."""
 
 import itertools
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -294,7 +295,7 @@ def thin(name: str) -> Any:
         "capsule": sw.Capsule(0.01, 0.2),
         "cylinder": sw.Cylinder(0.1, 0.005),
         "mesh": sw.RigidMesh(*flat.surface()),
-        "grid": sw.SDF.from_mesh(*sw.Box((0.3, 0.3, 0.05)).surface(), 0.01),
+        "grid": partial(cases.grid, (0.3, 0.3, 0.05), 0.01),
     }[name]
 
 
@@ -308,7 +309,7 @@ def thin(name: str) -> Any:
 def test_fast_ball_does_not_tunnel(name: str, precision: str) -> None:
     """v dt = 3 radii against targets as thin as an eighth of the ball, from many phases of the step (7.5)."""
     r, v, dt, worlds = 0.02, 6.0, 0.01, 16
-    target = thin(name)
+    target = cases.made(thin(name))
     direction = np.array([0.0, 0.0, -1.0])
     if name in ("plane", "box", "mesh"):
         direction = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
@@ -367,7 +368,7 @@ RESTING = {
     "lying cylinder": (sw.Cylinder(0.05, 0.1), 0.05, LYING),
     "lying capsule": (sw.Capsule(0.03, 0.1), 0.03, LYING),
     "mesh": (solid_box(0.05, 0.1), 0.0, UPRIGHT),
-    "grid": (sw.SDF.from_mesh(*sw.Box((0.1,) * 3).surface(), 0.005), 0.05, UPRIGHT),
+    "grid": (partial(cases.grid, (0.1,) * 3, 0.005), 0.05, UPRIGHT),
     "compound": (
         sw.Compound([(sw.Box((0.1, 0.1, 0.05)), (0, 0, 0.025)), (sw.Sphere(0.03), (0, 0, 0.07))]),
         0.0,
@@ -378,7 +379,7 @@ GROUNDS = {
     "plane": (sw.Plane(), 0.0),
     "box": (sw.Box((0.4, 0.4, 0.1)), 0.05),
     "mesh": (sw.RigidMesh(*sw.Box((0.4, 0.4, 0.1)).surface()), 0.05),
-    "grid": (sw.SDF.from_mesh(*sw.Box((0.4, 0.4, 0.1)).surface(), 0.01), 0.05),
+    "grid": (partial(cases.grid, (0.4, 0.4, 0.1), 0.01), 0.05),
     "cylinder": (sw.Cylinder(0.2, 0.1), 0.05),
 }
 
@@ -393,6 +394,7 @@ GROUNDS = {
 def test_rest(name: str, ground: str, precision: str) -> None:
     """After a drop of 1 cm: gap 0 to 1e-6 of the size, sum of normal forces m g, lambda >= 0, lambda gap = 0 (7.6)."""
     (shape, lift, attitude), (target, top) = RESTING[name], GROUNDS[ground]
+    shape, target = cases.made(shape), cases.made(target)
     pose = (0.003, 0.002, top + lift + 0.01, *attitude)
     sim, body, other = pair(target, shape, pose, mu=0.5, precision=precision)
     run(sim, 200)

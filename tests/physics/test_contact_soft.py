@@ -1,6 +1,7 @@
 """Soft bodies in contact (catalogue 7.3, 7.10 to 7.12): slopes, belts, shapes, impact, momentum, rest."""
 
 import itertools
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 import softwarp as sw
 from softwarp import meshing
-from tests import cases
+from tests import cases, contact_cases
 from tests.contact_cases import LYING, G, array, contacts, placed, run, slope
 
 both = pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -67,7 +68,7 @@ TARGETS: dict[str, Any] = {
     "lying cylinder": (sw.Cylinder(0.05, 0.3), (0, 0, -0.05, *LYING)),
     "standing cylinder": (sw.Cylinder(0.03, 0.1), (0, 0, -0.05)),
     "mesh": (sw.RigidMesh(*sw.Box((0.3, 0.3, 0.1)).surface()), (0, 0, -0.05)),
-    "grid": (sw.SDF.from_mesh(*sw.Box((0.3, 0.3, 0.1)).surface(), 0.01), (0, 0, -0.05)),
+    "grid": (partial(contact_cases.grid, (0.3, 0.3, 0.1), 0.01), (0, 0, -0.05)),
 }
 
 
@@ -80,7 +81,8 @@ TARGETS: dict[str, Any] = {
 )
 def test_soft_block_rests_on_shapes(name: str, precision: str) -> None:
     """Its weight is carried, it comes to rest and does not enter the shape by more than 0.1 % of its size."""
-    target, pose = TARGETS[name]
+    shape, pose = TARGETS[name]
+    target = contact_cases.made(shape)
     builder = sw.ModelBuilder()
     mesh = placed(meshing.box((0.1, 0.1, 0.06), (4, 4, 3)), (-0.047, -0.048, 0.005))
     block = builder.add_tets(mesh, material=SOFT, density=1000, rayleigh=(1.0, 0.01))

@@ -4,7 +4,7 @@ A block of L on its own reads two blocks for each of its products, and with eigh
 than a core's own cache, so the arithmetic waits. Columns j, j + 1 ... that each are the parent of the one before, with
 its rows but for the first, form a *strip* of up to ``WIDTH`` columns. All products of two strips read a block once for
 every column of the other one, in the order in which blocks lie in memory. Nothing is stored twice or filled in. A
-large world by itself goes strip by strip, too (``runs``). Runs once per simulation, on the host. Theory:
+large world by itself goes strip by strip, too (``runs``). Runs once per structure, on the host. Theory:
 docs/theory/cholesky.md.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -79,8 +80,18 @@ def runs(symbolic: Symbolic) -> Runs:
     )
 
 
+_schedules: WeakKeyDictionary[Symbolic, dict[int, Strips]] = WeakKeyDictionary()
+
+
 def schedule(symbolic: Symbolic, most: int = WIDTH) -> Strips:
-    """Divide the columns into strips of some at most, and list the sources of each."""
+    """Divide the columns into strips of some at most, and list the sources of each; once for all systems."""
+    made = _schedules.setdefault(symbolic, {})
+    if most not in made:
+        made[most] = _schedule(symbolic, most)
+    return made[most]
+
+
+def _schedule(symbolic: Symbolic, most: int) -> Strips:
     start = starts(symbolic, most)
     rows = [_rows_below(symbolic, int(end) - 1) for end in start[1:]]
     strip_of = np.repeat(np.arange(start.size - 1), np.diff(start))
