@@ -50,7 +50,6 @@ class ImplicitEuler:
         self.iterations = system.options.newton_iterations if iterations is None else iterations
         self.control = (control or NewtonControl(system)) if self.iterations > 1 else None
         self.judged = judged
-        self.keeps = control is None  # contacts of earlier iterates
         self.swings, self.brief = swings, brief
         self.tells = tells and self.control is not None
 
@@ -113,7 +112,7 @@ class ImplicitEuler:
             system.move(h)
             system.measure_rows()
             system.row_laws()
-        system.find_contacts(h, moving=moving, look=self.pace.look, keeps=self.keeps and iteration > 0)
+        system.find_contacts(h, moving=moving, look=self.pace.look)
         control.hold_still()
         system.forces()
         system.tangent()

@@ -45,7 +45,6 @@ class NewtonAdjoint(StageAdjoint):
     """
 
     follows = 0.0
-    keeps = True
     touches = EndContacts
 
     def __init__(

@@ -45,7 +45,6 @@ class ContactTerm(Term):
             model.capacity,
             shard.device,
             patient=shard.options.newton_iterations == 1 and shard.options.contact_passes > 0,
-            steady=shard.options.newton_iterations > 1,
         )
         self.contacts = self.detector.contacts
         self.late: Rows | None = None
@@ -80,14 +79,14 @@ class ContactTerm(Term):
         laws = [values.real for values in vars(self.pairs).values()]
         s.each_real(s.k_state.check_pairs, self.model.count, laws, [w.flag.real])
 
-    def find(self, h: float, look: float, *, moving: bool, falling: bool, keeps: bool = False) -> None:
+    def find(self, h: float, look: float, *, moving: bool, falling: bool) -> None:
         """Contacts at the trial positions."""
         s = self.shard
         if moving:
-            self.detector.remember(notes=keeps)
+            self.detector.remember()
         if s.options.newton_iterations == 1:  # more iterations look again where the bodies have come to
             self.detector.slack = MARGIN * look * look * self.gravity if falling else 0.0
-        self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], look, self.pairs, keeps=keeps)
+        self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], look, self.pairs)
         if moving:
             self._rebase(h)
 
