@@ -157,8 +157,6 @@ def _reduced(sim: Simulation) -> Iterator[str]:
     if model.reduction.floating is not None and model.has_moving_frames:
         parts = "rods, and rigid bodies that move or carry something"
         yield f"{told} in a floating frame beside {parts}, yet; train the reduction with frame='fixed'"
-    if sim.options.integrator != "euler":
-        yield f"{told} with integrator {sim.options.integrator!r} yet; take integrator='euler'"
     if sim.options.newton_iterations > 1:
         yield f"{told} with newton_iterations={sim.options.newton_iterations} yet; take newton_iterations=1"
     if model.joints is not None:

@@ -169,9 +169,11 @@ class RowDirections:
         self._moves = torch.as_tensor(places[:count] >= 0).to(device)
         self._shapes = None if model.reduction is None else Shapes(model, worlds.gradients["node_x"])
         self._frames: FrameSlopes | None = None
+        self._is_plain = False  # whether amplitudes follow from their velocities
         if self._shapes is not None:
             if model.reduction is not None and model.reduction.floating is not None:
                 self._frames = FrameSlopes(model.reduction, model.reduction.floating, worlds.gradients["node_x"])
+            self._is_plain = self._frames is None and worlds.sim.options.integrator == "euler"
             self._follows[self._shapes.node] = True
             self._moves[self._shapes.node] = False
 
@@ -206,7 +208,7 @@ class RowDirections:
         before = held["node_x"].reshape(x.shape) if "node_x" in held else torch.zeros_like(x)
         found["node_x"] = torch.where(self._follows[:, None], before + worlds.h * v, x)
         if self._shapes is not None:
-            if self._frames is None:
+            if self._is_plain:
                 found["mode_q"] = worlds.h * found["mode_v"]
                 if "mode_q" in held:
                     found["mode_q"] += held["mode_q"].reshape(found["mode_q"].shape)
@@ -241,8 +243,8 @@ class RowDirections:
                 counts &= ~self._follows[:, None]
             elif name == "node_v":
                 counts &= (self._moves | ~self._follows)[:, None]
-            elif name == "mode_q":  # follow from their velocities, but for momentum that frames have turned
-                counts[:] = self._frames is not None
+            elif name == "mode_q":  # follow from their velocities, but for momentum that frames have turned, and stages
+                counts[:] = not self._is_plain
             elif name in FRAMES:  # centres of mass follow from their bodies, and nobody asks for them
                 counts[self.worlds.model.rigid_count + self.worlds.model.rod_node_count :] = False
             for row in counts.flatten().nonzero().flatten().tolist():

@@ -426,8 +426,8 @@ class StepAdjoint:
             self.modes.place(w.dof_v, self.p, self.node_v, self.node_p, everywhere=everywhere)
         if self.frames is not None:
             self.frames.carry(self.p, self.node_v, self.node_p)
+        self._feel()
         if self.leaning is not None:
-            self.leaning.velocities(self.node_v)
             self.leaning.push(self.seed, self.q)
             if self.contact is not None and self.leaning.multiply is None:
                 self.contact.add_forces(self.leaning.pushed)
@@ -456,6 +456,11 @@ class StepAdjoint:
         s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.point.real])
         if m.cavities is not None:
             self._to_surfaces(m.cavities, fields)
+
+    def _feel(self) -> None:
+        """What elements and rows have in the place of velocities."""
+        if self.leaning is not None:
+            self.leaning.velocities(self.node_v)
 
     def _to_surfaces(self, c: CavityModel, fields: list[wp.array]) -> None:
         """Gradients by the points of chambers."""

@@ -168,6 +168,7 @@ class Leaning:
         self.sums = s.rows(relaxation_adjoint.SUM_ROWS * m.body_count)
         self.value = s.rows(2 * max(m.frame_count, 1))
         self.multiply: Callable[[Rows], None] | None = None  # A p, where p is not the solution of the seed alone
+        self.more_products: Callable[[Rows, Rows, Rows], None] | None = None  # of modes, added to ``sums``
         self.before = wp.zeros_like(gradients.rayleigh_stiffness)
         self.bare = s.rows(6 * max(m.frame_count, 1)) if frames is None else frames.bare
 
@@ -243,6 +244,8 @@ class Leaning:
         inputs = [self.h, s.lanes, term is not None, self.index.body_node_start, m.node_dof, bars, self.product.real]
         inputs += [self.start_node.real, self.lean_node.real, memory.real, node_v.real]
         s.each_real(k.sums, m.body_count, inputs, [self.sums.real])
+        if self.more_products is not None:
+            self.more_products(self.pushed, self.start_v, self.sums)
         beta = s.felt["beta"].real
         if term is None:
             inputs = [self.h, s.lanes, w.body_damping.real, beta, self.sums.real]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import warp as wp
 
 from softwarp.kernels.elements import adjoint_sums, mode_adjoint, mode_loads, reduction
+from softwarp.kernels.frames import relaxation_adjoint
 from softwarp.model.gradients import Gradients
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.floating_adjoint import FloatingAdjoint
+from softwarp.solvers.leaning_adjoint import Leaning
 from softwarp.solvers.terms.reduction import ReductionTerm
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -62,13 +66,18 @@ class ModeAdjoint:
     def _add(self, listed: Rows, by_modes: wp.array) -> None:
         """by_modes += Phi' by listed nodes."""
         s, m = self.shard, self.model
+        self.gather(listed)
+        if self.frames is not None:
+            self.frames.rigid_bars(self.wide, by_velocities=listed is self.listed_v)
+        s.each_real(self.k.add_modes, m.count, [s.lanes, m.mode_wide, self.wide.real], [by_modes])
+
+    def gather(self, listed: Rows) -> None:
+        """Phi' by listed nodes, into ``wide``."""
+        s, m = self.shard, self.model
         self.wide.zero()
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
         items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
         s.each(self.k_loads.add_forces, items, [*inputs, listed.S], [self.wide.S])
-        if self.frames is not None:
-            self.frames.rigid_bars(self.wide, by_velocities=listed is self.listed_v)
-        s.each_real(self.k.add_modes, m.count, [s.lanes, m.mode_wide, self.wide.real], [by_modes])
 
     def seed(self, seed: Rows, y: Rows, *, arrives: bool) -> None:
         """Right-hand sides of p, from gradients by the end of a step; those by nodes are taken over first.
@@ -127,3 +136,58 @@ class ModeAdjoint:
         inputs += [i["density"].real, w.body_mass.real, i["gravity"].real, i["mode_v0"].real]
         inputs += [self.wide_v.real, self.wide_p.real, self.mass_p.real]
         s.each_real(self.k.bodies, None, inputs, [g.density, g.rayleigh_mass, g.gravity])
+
+
+class StageModes:
+    """What modes have of the velocities that a stage is linearised with; see ``StageAdjoint``.
+
+    Args:
+        modes: Those of the stage.
+        k: Kernels of ``step.stage_adjoint``.
+    """
+
+    def __init__(self, modes: ModeAdjoint, k: SimpleNamespace) -> None:
+        self.modes, self.k = modes, k
+
+    def velocities(self, leaning: Leaning, node_v: Rows) -> None:
+        """What elements and rows have in the place of velocities of nodes; needs those of ``leaning``."""
+        modes = self.modes
+        s, m, t = modes.shard, modes.model, modes.term
+        s.each(modes.k_modes.widen_dofs, m.wide_count, [m.wide_mode, m.mode_dof, leaning.start_v.S], [modes.wide.S])
+        start, spare = leaning.start_node, leaning.row_v
+        t.place_both(modes.at_zero, modes.wide, modes.wide, start, spare, m.active_count)
+        inputs = [m.node, s.model.node_body, s.work.body_damping.real, node_v.real, start.real]
+        outputs = [leaning.element_v.real, leaning.row_v.real]
+        s.each_real(self.k.mode_velocities, m.active_count, inputs, outputs)
+
+    def to_state(
+        self, h: float, follows: float, heeds: Rows, seed: Rows, pushed: Rows, node_bar: Rows, ahead: Rows
+    ) -> None:
+        """Gradients by the velocities of modes at the start of the stage.
+
+        Args:
+            h: Length of the stage [s].
+            follows: As of ``StageAdjoint``.
+            heeds: Likewise.
+            seed: Of the velocities, less what contacts have.
+            pushed: As of ``Leaning``.
+            node_bar: Gradients by positions of nodes where the stage is linearised.
+            ahead: Receives those by the velocities that it is linearised with.
+        """
+        modes = self.modes
+        s, m, g = modes.shard, modes.model, modes.gradients
+        modes.to_state()
+        s.each_real(self.k.listed_bars, int(m.node.size), [m.node, node_bar.real], [modes.listed.real])
+        modes.gather(modes.listed)
+        inputs = [h, follows, s.lanes, m.block_body, m.mode_dof, m.mode_wide]
+        inputs += [heeds.real, s.input["density"].real, s.felt["beta"].real, s.work.body_mass.real]
+        inputs += [seed.real, pushed.real, modes.mass_p.real, modes.wide.real]
+        s.each_real(self.k.modes, m.count, inputs, [g.mode_v, ahead.real])
+
+    def add_products(self, pushed: Rows, start_v: Rows, sums: Rows) -> None:
+        """Add what stiffness times p has along the velocities that the stage is linearised with; needs ``to_state``."""
+        modes = self.modes
+        s, m = modes.shard, modes.model
+        inputs = [relaxation_adjoint.SUM_ROWS, m.body_number, modes.start, m.mode_dof]
+        inputs += [s.input["density"].real, s.work.body_mass.real, pushed.real, modes.mass_p.real, start_v.real]
+        s.each_real(self.k.mode_products, len(m.body), inputs, [sums.real])

@@ -12,7 +12,7 @@ from softwarp.kernels.frames import extrapolated_adjoint
 from softwarp.kernels.step import stage_adjoint
 from softwarp.model import memory
 from softwarp.model.frames import FrameModel
-from softwarp.model.gradients import FRAMES, MEMORIES, Gradients
+from softwarp.model.gradients import FRAMES, MEMORIES, MODES, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.implicit_euler import ImplicitEuler
@@ -23,7 +23,7 @@ from softwarp.solvers.second_order import ALL, SMOOTH, THIRD, PredictedEuler, Se
 from softwarp.solvers.stage_adjoint import StageAdjoint
 from softwarp.solvers.workspace.rows import Rows
 
-MOVED = ("node_x", "node_v", *MEMORIES)  # what is extrapolated along straight lines
+MOVED = ("node_x", "node_v", *MEMORIES, *MODES)  # what is extrapolated along straight lines
 
 
 class SecondOrderAdjoint:

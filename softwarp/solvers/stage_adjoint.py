@@ -13,6 +13,7 @@ from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.leaning_adjoint import LeaningFrames
+from softwarp.solvers.mode_adjoint import StageModes
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.workspace.rows import Rows
@@ -30,6 +31,8 @@ class StartContacts(ContactAdjoint):
     def begin(self, v: Rows, *, first: bool = True) -> None:
         """As of ``ContactAdjoint``, with these velocities."""
         super().begin(self.solved_v, first=first)
+        if self.subspace is not None:  # nodes of modes have theirs by now
+            v.copy_from(self.solved_v)
 
     def to_state(self, p: Rows) -> None:
         """As of ``ContactAdjoint``; everything is at the start of the stage afterwards."""
@@ -98,6 +101,11 @@ class StageAdjoint(StepAdjoint):
         self.volume = s.rows(s.work.cavity_volume.real.shape[1])
         self.start_gradient = s.rows(s.work.point_gradient.real.shape[1])
         self.start_point = s.rows(s.work.point_gradient.real.shape[1])
+        self.stage_modes = None
+        if self.modes is not None:
+            self.modes.is_lone = False  # there are gradients by velocities
+            self.stage_modes = StageModes(self.modes, self.k_stage)
+            self.leaning.more_products = self.stage_modes.add_products
 
     def prepare(self, *, without: tuple[str, ...] = ()) -> None:
         """All that ``pull`` needs of the stage but its solution."""
@@ -178,7 +186,15 @@ class StageAdjoint(StepAdjoint):
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real, self.start_point.real]
         outputs = [g.node_x, g.node_v, g.command_node_force, self.ahead.real]
         s.each_real(self.k_stage.nodes, m.node_count, inputs, outputs)
+        if self.stage_modes is not None:
+            scalars = (self.h, self.follows)
+            self.stage_modes.to_state(*scalars, self.heeds, seed, self.leaning.pushed, self.node_bar, self.ahead)
         self._to_tractions()
+
+    def _feel(self) -> None:
+        super()._feel()
+        if self.stage_modes is not None and self.leaning is not None:
+            self.stage_modes.velocities(self.leaning, self.node_v)
 
     def _note_start(self) -> None:
         """Keep what is measured at the start of the stage, before it is where its velocities lead to."""

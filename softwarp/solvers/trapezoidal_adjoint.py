@@ -7,7 +7,7 @@ from dataclasses import fields
 import warp as wp
 
 from softwarp.model import memory
-from softwarp.model.gradients import FRAMES, MEMORIES, STATE, Gradients
+from softwarp.model.gradients import FRAMES, MEMORIES, MODES, STATE, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.implicit_euler import ImplicitEuler
@@ -53,7 +53,7 @@ class LaterAdjoint(StageAdjoint):
         self.found_v = self.shard.rows(self.shard.dof_room)
         self.earlier = EarlierAdjoint(step.system, step.h, step.pace, step.predict, gradients, index, rest=rest)
         self.earlier.later = self
-        names = [*STATE, *FRAMES, *MEMORIES]
+        names = [*STATE, *FRAMES, *MEMORIES, *MODES]
         names += [field.name for field in fields(gradients) if field.name.startswith("command_")]
         parts = [getattr(gradients, name) for name in names]
         self.sums = [
@@ -118,6 +118,9 @@ class TrapezoidalAdjoint(SecondOrderAdjoint):
             self._copy(ALL, {name: stepper.arrays[name] for name in stop}, stop)
             stepper.extrapolate(number)
         self._take_carried()
+        modes = self.pulls[0].modes
+        if modes is not None:
+            modes.take(at_end=True)
         for number in reversed(range(len(stepper.stages))):
             stage = stepper.stages[number]
             self._copy(ALL, self.starts[number], stepper.arrays)

@@ -137,6 +137,105 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 force_bar_out[world, row] = h * node_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def mode_velocities(
+        # Model
+        listed: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        # Workspace in
+        damping_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        start_v_in: wp.array3d(dtype=real),
+        # Workspace out
+        element_v_out: wp.array3d(dtype=real),
+        row_v_out: wp.array3d(dtype=real),
+    ):
+        """What elements and rows have in the place of the velocity of one node that follows modes."""
+        pack, item, lane = wp.tid()
+        node = listed[item]
+        v = vector_at(v_in, pack, lane, 3 * node)
+        v0 = vector_at(start_v_in, pack, lane, 3 * node)
+        share = real(1.0) - damping_in[pack, node_body[node], lane]
+        put(row_v_out, pack, lane, 3 * node, v - v0)
+        put(element_v_out, pack, lane, 3 * node, v - share * v0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def listed_bars(
+        # Model
+        listed: wp.array(dtype=wp.int32),
+        # Workspace in
+        node_bar_in: wp.array3d(dtype=real),
+        # Workspace out
+        listed_out: wp.array3d(dtype=real),
+    ):
+        """Gradient by the position of one listed node."""
+        pack, item, lane = wp.tid()
+        put(listed_out, pack, lane, 3 * item, vector_at(node_bar_in, pack, lane, 3 * listed[item]))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def modes(
+        h: real,
+        follows: real,
+        lanes: int,
+        # Model
+        block_body: wp.array(dtype=wp.int32),
+        mode_dof: wp.array(dtype=wp.int32),
+        mode_wide: wp.array(dtype=wp.int32),
+        # Workspace in
+        predicts_in: wp.array3d(dtype=real),
+        density_in: wp.array3d(dtype=real),
+        beta_in: wp.array3d(dtype=real),
+        body_mass_in: wp.array3d(dtype=real),
+        seed_in: wp.array3d(dtype=real),
+        pushed_in: wp.array3d(dtype=real),
+        mass_p_in: wp.array3d(dtype=real),
+        wide_bar_in: wp.array3d(dtype=real),
+        # State out
+        v_bar_out: wp.array2d(dtype=real),
+        # Workspace out
+        ahead_out: wp.array3d(dtype=real),
+    ):
+        """The same as of ``nodes`` by the velocity of one mode, to which rho M p is known; ``mass_p_in`` is M p."""
+        pack, mode, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < v_bar_out.shape[0]:
+            body = block_body[mode / 3]
+            row = 3 * mode_dof[mode / 3] + mode % 3
+            pushed = pushed_in[pack, row, lane]
+            share = h / (h + beta_in[pack, body, lane])
+            mass_p = body_mass_in[pack, body, lane] * density_in[pack, body, lane] * mass_p_in[pack, mode, lane]
+            by_v = h * wide_bar_in[pack, mode_wide[mode], lane] + seed_in[pack, row, lane] - pushed
+            by_v += share * (pushed - mass_p)
+            ahead_out[pack, row, lane] = by_v
+            v_bar_out[world, mode] = v_bar_out[world, mode] + follows * predicts_in[pack, 0, lane] * by_v
+
+    @wp.kernel(module=module, enable_backward=False)
+    def mode_products(
+        sum_rows: int,
+        # Model
+        body_number: wp.array(dtype=wp.int32),
+        mode_start: wp.array(dtype=wp.int32),
+        mode_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        density_in: wp.array3d(dtype=real),
+        body_mass_in: wp.array3d(dtype=real),
+        pushed_in: wp.array3d(dtype=real),
+        mass_p_in: wp.array3d(dtype=real),
+        start_v_in: wp.array3d(dtype=real),
+        # Workspace out
+        sum_out: wp.array3d(dtype=real),
+    ):
+        """Add k K p . w of the modes of one reduced body to the first of the sums over its nodes."""
+        pack, number, lane = wp.tid()
+        body = body_number[number]
+        scale = density_in[pack, body, lane] * body_mass_in[pack, body, lane]
+        total = real(0.0)
+        for mode in range(mode_start[number], mode_start[number + 1]):
+            row = 3 * mode_dof[mode / 3] + mode % 3
+            total += (pushed_in[pack, row, lane] - scale * mass_p_in[pack, mode, lane]) * start_v_in[pack, row, lane]
+        row = sum_rows * body
+        sum_out[pack, row, lane] = sum_out[pack, row, lane] + total
+
+    @wp.kernel(module=module, enable_backward=False)
     def add_ahead(
         # Model
         dof_free: wp.array2d(dtype=real),
@@ -192,6 +291,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         start_points=start_points,
         start_frames=start_frames,
         nodes=nodes,
+        mode_velocities=mode_velocities,
+        listed_bars=listed_bars,
+        modes=modes,
+        mode_products=mode_products,
         add_ahead=add_ahead,
         part=part,
         add=add,
