@@ -15,13 +15,13 @@ from softwarp.kernels.elements import (
     samples,
 )
 from softwarp.model.floating import FloatingModel
-from softwarp.model.gradients import Gradients
+from softwarp.model.gradients import Ends, Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.element_adjoint import TetAdjoint
 from softwarp.solvers.membrane_adjoint import MembraneAdjoint
 from softwarp.solvers.terms.floating import FloatingFrames
 from softwarp.solvers.terms.reduction import ReductionTerm
-from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.rows import Rows, alias
 from softwarp.solvers.workspace.shard import Shard
 
 
@@ -59,13 +59,15 @@ class Places:
             s.each(k.widen, r.wide_count, [r.wide_mode, values.S], [wide.S])
         s.each_real(self.frames.k.at_rest, self.model.count, [self.model.first_wide], [self.wide_q.real])
 
-    def place(self) -> None:
-        """All listed nodes and their velocities; needs ``widen``."""
+    def place(self, *, moves: bool) -> None:
+        """All listed nodes and, if it ``moves``, their velocities; needs ``widen``."""
         s, m, r, k = self.shard, self.model, self.term.model, self.frames.k
         self.term.place_both(r.node_rest, self.wide_q, self.wide_v, self.x, self.node_v)
         listed = [m.listed, m.listed_body, r.node]
         inputs = [int(r.node.size), *listed, self.turn.real, self.centre.real]
         s.each_real(k.place_nodes, int(m.listed.size), inputs, [self.x.real])
+        if not moves:
+            return
         inputs = [*listed, m.first, m.radius, self.turn.real, self.centre.real, self.v.real, self.x.real]
         s.each_real(k.node_velocities, int(m.listed.size), inputs, [self.node_v.real])
 
@@ -81,6 +83,7 @@ class FloatingAdjoint:
 
     Attributes:
         own_v, own_p: v and p of nodes as their elements feel them without turning.
+        is_end_known: Whether what ``hold`` has been told of says where nodes are at the end of the step.
         touch_p, touch_v: What contacts have by p and v of the nodes that touch something, behind those of dofs.
     """
 
@@ -105,16 +108,32 @@ class FloatingAdjoint:
         self.corner, self.no_point = shard.rows(corners), shard.rows(3 * points)
         self.parameter: list[Rows] = []
         self.asks = True
+        self.is_end_known = False
+        self._ends: list[tuple[wp.array, Rows]] = []
         touch = np.full(int(term.model.node.size), -1)
         touch[term.model.touch_listed.numpy()] = np.arange(int(term.model.touch_listed.size))
         self.listed_touch = wp.array(touch, dtype=wp.int32, device=shard.device)
         self.touch_p, self.touch_v = (shard.rows(3 * shard.model.dof_room) for _ in range(2))
 
-    def find_places(self, *, arrives: bool) -> None:
+    def hold(self, ends: Ends) -> None:
+        """Nodes at the end of a step are in ``ends`` wherever ``is_end_known``."""
+        self._ends = [(ends.node_x, self.end.x), (ends.node_v, self.end.node_v)]
+
+    def _take_ends(self, *, moves: bool) -> None:
+        s = self.shard
+        for array, target in self._ends if moves else self._ends[:1]:
+            if s.variant.lanes > 1:
+                inputs = [array, s.world_count, s.lanes]
+                s.each_real(s.k_state.interleave, None, inputs, [target.real])
+            else:
+                target.copy_from(alias(s.variant, array))
+
+    def find_places(self, *, arrives: bool, moves: bool = True) -> None:
         """Where all nodes were and are; needs the solution of the step.
 
         Args:
             arrives: Whether bodies turn on as at the end of a step, with their momentum, and not as in a look ahead.
+            moves: Whether velocities of nodes at the end matter.
         """
         s, m, r, i, w = self.shard, self.model, self.term.model, self.shard.input, self.shard.work
         start, end, k = self.start, self.end, self.start.frames.k_inertia
@@ -128,15 +147,18 @@ class FloatingAdjoint:
         end.frame(self.h)
         end.widen()
         if not arrives:
-            end.place()
+            end.place(moves=moves)
             return
         for wide, target in ((end.wide_q, self.moment), (end.wide_v, self.rate)):
             inputs = [m.moment_first, m.moment_wide, m.moment_stride, m.moments, wide.S]
             s.each(k.moments, int(m.moment_body.size), inputs, [target.S])
         outputs = [end.v.real, end.turn.real]
         s.each_real(k.turn_on, m.count, [*self._motion(), *self._moments(), self.h], outputs)
+        if self.is_end_known:
+            self._take_ends(moves=moves)
+            return
         end.widen()
-        end.place()
+        end.place(moves=moves)
 
     def _motion(self) -> list[wp.array]:
         m, i, w = self.model, self.shard.input, self.shard.work
@@ -151,12 +173,22 @@ class FloatingAdjoint:
         s, outputs = self.shard, [self.gradients.mode_turn, self.turn_bar.real]
         s.each_real(self.k.take_turns, self.model.count, [s.lanes, self.end.turn.real], outputs)
 
-    def turn_bars(self, by_x: Rows, by_v: Rows, *, at_end: bool) -> None:
-        """Gradients by listed nodes go to the axes of their bodies; what is of the frames is kept aside."""
+    def turn_bars(self, by_x: Rows, by_v: Rows | None, *, at_end: bool) -> None:
+        """Gradients by listed nodes go to the axes of their bodies; what is of the frames is kept aside.
+
+        Args:
+            by_x: Gradients by places.
+            by_v: By velocities; None where there are none.
+            at_end: Whether nodes are those of the end of the step.
+        """
         s, m, at = self.shard, self.model, self.end if at_end else self.start
-        inputs = [m.listed_start, m.listed, self.term.model.node, m.first, m.radius]
-        inputs += [at.turn.real, at.centre.real, at.x.real, at.node_v.real, at.v.real]
-        inputs.append((self.no_arm if at_end else self.arm).real)
+        arm = self.no_arm if at_end else self.arm
+        inputs = [m.listed_start, m.listed, self.term.model.node]
+        if by_v is None:
+            inputs += [at.turn.real, at.centre.real, at.x.real, arm.real]
+            s.each_real(self.k.place_bars, m.count, inputs, [by_x.real, self.rigid.real, self.turn_bar.real])
+            return
+        inputs += [m.first, m.radius, at.turn.real, at.centre.real, at.x.real, at.node_v.real, at.v.real, arm.real]
         outputs = [by_x.real, by_v.real, self.rigid.real, self.turn_bar.real]
         s.each_real(self.k.node_bars, m.count, inputs, outputs)
 
