@@ -168,9 +168,12 @@ class StepAdjoint:
                 term.points.stiffness()
             elif isinstance(term, MembraneTerm):
                 term.stiffness()
-        for term in self.system.terms:
-            if isinstance(term, ReductionTerm) and term.frames is not None:
-                term.sample(drag=False)  # which the solution has
+        self._take_samples()
+
+    def _take_samples(self) -> None:
+        """Stiffness of elements in floating frames, in the world's axes, which that of A is not."""
+        if self.modes is not None and self.modes.frames is not None:
+            self.modes.term.take_samples()
 
     def _find_forces(self) -> None:
         self.system.forces()
@@ -203,6 +206,7 @@ class StepAdjoint:
         system.right_hand_side(h, inertia=True, moving=False)
         system.solve(h, h)
         system.add_unknowns()
+        self._take_samples()
         if self.contact is not None:  # which has been looked for where the step leads to
             self._start_over()
 
@@ -422,7 +426,7 @@ class StepAdjoint:
             outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
             s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
         if self.modes is not None:
-            everywhere = self.by_forces or self.modes.frames is not None
+            everywhere = self.by_forces or (self.modes.frames is not None and s.variant.world_fastest)
             self.modes.place(w.dof_v, self.p, self.node_v, self.node_p, everywhere=everywhere)
         if self.frames is not None:
             self.frames.carry(self.p, self.node_v, self.node_p)
@@ -491,7 +495,7 @@ class StepAdjoint:
             if self.modes.frames is not None:
                 if self.contact is not None:
                     self.contact.push_nodes(self.modes.frames.touch_p, self.modes.frames.touch_v)
-                self.modes.frames.to_state(self.index, self.p, self.q, self.corner)
+                self.modes.frames.to_state(self.index, self.p, self.modes.wide_p, self.q, self.corner)
         self._to_tractions()
 
     def _to_modes(self, modes: ModeAdjoint) -> None:
@@ -506,7 +510,7 @@ class StepAdjoint:
             s.each_real(self.k.node_forces, parts, inputs, [self.gradients.command_node_force])
             self._to_tractions()
         if modes.frames is not None:
-            modes.frames.to_state(self.index, self.p, self.q, self.corner)
+            modes.frames.to_state(self.index, self.p, modes.wide_p, self.q, self.corner)
 
     def _to_tractions(self) -> None:
         s, m, g = self.shard, self.model, self.gradients

@@ -121,7 +121,7 @@ class ModeAdjoint:
         count = int(m.node.size) if everywhere else m.active_count
         t.place_both(self.at_zero, self.wide_v, self.wide_p, node_v, node_p, count)
         if self.frames is not None:
-            self.frames.place(p, node_v, node_p)
+            self.frames.place(p, node_v, node_p, count)
 
     def to_state(self) -> None:
         """Gradients by the velocities at the start of the step; needs ``place``."""

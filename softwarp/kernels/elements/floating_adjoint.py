@@ -488,6 +488,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def turn_fields(
+        last: int,
         # Model
         listed: wp.array(dtype=wp.int32),
         listed_body: wp.array(dtype=wp.int32),
@@ -507,7 +508,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_v_out: wp.array3d(dtype=real),
         node_p_out: wp.array3d(dtype=real),
     ):
-        """v and p of one listed node: what its modes have, in the world's axes, and all of it; on a CPU of all."""
+        """v and p of one listed node before ``last``: what its modes have, in the world's axes, and all of it.
+
+        On a CPU of all these.
+        """
         pack, part, lane = wp.tid()
         begin = int(0)
         end = listed.shape[0]
@@ -533,10 +537,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 w = vector_at(dof_v_in, pack, lane, about) / radius[f]
                 p = vector_at(dof_p_in, pack, lane, along)
                 q = vector_at(dof_p_in, pack, lane, about) / radius[f]
-            row = 3 * node[listed[item]]
-            r = vector_at(x_in, pack, lane, row) - c
-            turn_field(R, node_v_out, pack, lane, row, v, w, r, own_v_out, node_v_out)
-            turn_field(R, node_p_out, pack, lane, row, p, q, r, own_p_out, node_p_out)
+            if listed[item] < last:
+                row = 3 * node[listed[item]]
+                r = vector_at(x_in, pack, lane, row) - c
+                turn_field(R, node_v_out, pack, lane, row, v, w, r, own_v_out, node_v_out)
+                turn_field(R, node_p_out, pack, lane, row, p, q, r, own_p_out, node_p_out)
 
     return SimpleNamespace(
         take_turns=take_turns,
