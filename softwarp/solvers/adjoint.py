@@ -155,12 +155,18 @@ class StepAdjoint:
         lifts = self.frames is not None and self.frames.lifts
         turns = self.modes is not None and self.modes.frames is not None
         self._load(() if lifts or turns else without)
+        if lifts:
+            self._find_forces()
+        elif turns:
+            self.system.loads()
+            for term in self.system.terms:
+                if isinstance(term, TetTerm):  # some laws prepare their stiffness there
+                    term.forces()
         if lifts or turns:
             self._stiffen()
 
     def _stiffen(self) -> None:
-        """Forces of elements, and stiffness where it is stored, that carried nodes need."""
-        self._find_forces()
+        """Stiffness of elements, where it is stored, that carried nodes and floating frames need."""
         for term in self.system.terms:
             if isinstance(term, TetTerm):
                 term.tets.stiffness()
