@@ -430,7 +430,8 @@ class StepAdjoint:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         if not self.has_modes_alone:
             outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
-            s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+            inputs = [m.node_dof, m.node_volume, w.dof_v.S, self.p.S]
+            s.each(self.k.to_nodes, s.variant.parts(m.node_count), inputs, outputs)
         if self.modes is not None:
             everywhere = self.by_forces or (self.modes.frames is not None and s.variant.world_fastest)
             self.modes.place(w.dof_v, self.p, self.node_v, self.node_p, everywhere=everywhere)
@@ -492,7 +493,8 @@ class StepAdjoint:
             self._to_modes(self.modes)
             return
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
-        s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
+        inputs += [self.corner.S, self.point.S]
+        s.each(self.k.node_sums, s.variant.parts(m.node_count), inputs, [self.node_bar.S])
         inputs = [self.h, s.lanes, m.node_body, i["density"].real]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
         s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])

@@ -103,7 +103,8 @@ class ModeAdjoint:
         """Gradients by listed nodes from those by corners and points; those behind the active ones have none."""
         s, m = self.shard, self.model
         self.listed.zero()
-        s.each(self.k_sums.listed_sums, m.active_count, [m.node, *sums], [self.listed.S])
+        inputs = [m.active_count, m.node, *sums]
+        s.each(self.k_sums.listed_sums, s.variant.parts(m.active_count), inputs, [self.listed.S])
 
     def place(self, v: Rows, p: Rows, node_v: Rows, node_p: Rows, *, everywhere: bool = True) -> None:
         """Velocities and p of nodes, from those of dofs.

@@ -420,6 +420,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         body_moduli=body_moduli,
         damping_scales=damping_scales,
         row_product=row_product,
+        corner_sum=corner_sum,
         node_forces=node_forces,
         node_loads=node_loads,
         block_mass=block_mass,
