@@ -325,7 +325,8 @@ class FloatingAdjoint:
         inputs = [self.h, s.model.dof_count, self.placed, m.listed_start, m.listed, self.listed_touch]
         inputs += [r.node, m.block, r.mode_dof, m.radius, *points, index.point_row]
         inputs += [s.model.corner_start, s.model.corner, r.node_body, r.node_basis, r.body_wide, r.body_stride, r.basis]
-        inputs += [at.turn.real, wide_p.real, at.centre.real, at.x.real, self.own_v.real, self.own_p.real, w.dof_v.real, p.real]
+        inputs += [at.turn.real, wide_p.real, at.centre.real, at.x.real]
+        inputs += [self.own_v.real, self.own_p.real, w.dof_v.real, p.real]
         inputs += [w.point_gradient.real, w.multiplier.real, q.real, w.node_external.real, corner.real]
         inputs += [self.touch_p.real, self.touch_v.real]
         s.each_real(self.k_pull.arm_bars, m.count, inputs, [self.arm.real, self.turn_bar.real])

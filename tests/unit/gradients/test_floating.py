@@ -180,7 +180,7 @@ def test_world_of_a_batch_that_touches_has_the_gradient_of_that_world_alone(prec
 @pytest.mark.parametrize("on", ["", pytest.param("floor", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("factors", [True, False])
 def test_what_else_is_asked_for_makes_no_difference(on: str, factors: bool) -> None:
-    """Of places alone, by one command, with loads on all nodes: no velocities, and p at few nodes, beside all of both."""
+    """Of places by one command, with loads on all nodes: without velocities and with p at few nodes, and with all."""
     sim = slab(on=on)
     rollout, given = Rollout(sim), given_of(sim, [1])
     assert given["controls"]["node_force"].abs().min() > 0.0
