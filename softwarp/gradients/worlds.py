@@ -223,9 +223,7 @@ class DifferentiableWorlds:
         self._refresh = Replayed(model.device, [system.refresh for _, system in twins], workers)
         self._pull, self._prepare, self._pull_kept = (
             {
-                (parameters, *way): Replayed(
-                    model.device, [_launches(pull, of_pull, *way) for pull in pulls], workers
-                )
+                (parameters, *way): Replayed(model.device, [_launches(pull, of_pull, *way) for pull in pulls], workers)
                 for parameters, of_pull in ((True, name), (False, f"{name}_alone"))
                 for way in product((True, False), repeat=3)
                 if hasattr(pulls[0], of_pull)
@@ -248,9 +246,7 @@ class DifferentiableWorlds:
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
 
-    def _hold_ends(
-        self, pulls: Sequence[tuple[slice, StepAdjoint | SecondOrderAdjoint]]
-    ) -> dict[str, torch.Tensor]:
+    def _hold_ends(self, pulls: Sequence[tuple[slice, StepAdjoint | SecondOrderAdjoint]]) -> dict[str, torch.Tensor]:
         """Views of what says where nodes are at the end of a step, for adjoints that go by that."""
         if self.model.reduction is None or self.model.reduction.floating is None:
             return {}
