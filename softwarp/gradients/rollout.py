@@ -276,8 +276,10 @@ class _Steps(torch.autograd.Function):
                     values[step // plan.every].copy_(worlds.state[name])
         check_steps(call)
         ctx.worlds, ctx.plan, ctx.room = worlds, plan, room
+        ctx.set_materialize_grads(False)
         fixed = [*worlds.control.values(), *worlds.parameters.values()]
-        ctx.save_for_backward(*tensors, *kept, *start.values(), *(value.clone() for value in fixed))
+        held = (values.detach() for values in kept)  # views of results that torch follows take their time
+        ctx.save_for_backward(*tensors, *held, *start.values(), *(value.clone() for value in fixed))
         ctx.save_for_forward(*tensors)
         return tuple(kept[: len(worlds.names)])
 
@@ -291,12 +293,12 @@ class _Steps(torch.autograd.Function):
         return tuple(slope[0] for slope in pushed)
 
     @staticmethod
-    def backward(ctx: Any, *by_kept: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, *by_kept: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         """Gradients by all tensors."""
         worlds, plan, saved = ctx.worlds, ctx.plan, list(ctx.saved_tensors)
         tensors = {name: saved.pop(0) for name in plan.names}
         names = (*worlds.names, *worlds.memory)
-        kept = {name: saved.pop(0) for name in names}
+        kept = {name: saved.pop(0).unbind(0) for name in names}
         start = {name: saved.pop(0) for name in names}
         for view in (*worlds.control.values(), *worlds.parameters.values()):
             view.copy_(saved.pop(0))
@@ -305,26 +307,33 @@ class _Steps(torch.autograd.Function):
         for view in gradients.values():
             view.zero_()
         by_commands = {name: torch.zeros_like(tensors[f"control.{name}"]) for name in call.commands}
+        by_steps = {
+            name: by.unbind(0) if name in plan.moving else (by,) * plan.steps for name, by in by_commands.items()
+        }
         asked = ctx.needs_input_grad[2:]
         wanted = [name for name, is_asked in zip(plan.names, asked, strict=True) if is_asked]
         parameters = any(name.startswith("params.") for name in wanted)
         forces = any(name in ("control.node_force", "control.traction") for name in wanted)
+        given = {name: by.unbind(0) for name, by in zip(worlds.names, by_kept, strict=True) if by is not None}
+        velocities = "node_v" in given
         room, ctx.room = ctx.room, None  # a second backward pass finds solutions again
         if plan.factors and plan.every > 1:
             room = worlds.solutions(plan.every)
         for segment in reversed(range(plan.steps // plan.every)):
             first = start if segment == 0 else {name: kept[name][segment - 1] for name in names}
             states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
-            for name, by in zip(worlds.names, by_kept, strict=True):
+            last = {name: values[segment] for name, values in kept.items()}
+            for name, by in given.items():
                 gradients[name].add_(by[segment])
             for offset in reversed(range(plan.every)):
                 step = segment * plan.every + offset
                 worlds.place(states[offset])
                 call.command(step)
                 place = step if plan.every == 1 else offset
-                worlds.pull(room, place, parameters=parameters, forces=forces)
-                for name, by in by_commands.items():
-                    (by[step] if name in plan.moving else by).add_(gradients[f"command_{name}"])
+                end = states[offset + 1] if offset + 1 < plan.every else last
+                worlds.pull(room, place, parameters=parameters, forces=forces, velocities=velocities, end=end)
+                for name, by_step in by_steps.items():
+                    by_step[step].add_(gradients[f"command_{name}"])
         if room is not None:
             worlds.give_back(room)
         check_adrift(worlds)

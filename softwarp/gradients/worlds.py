@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -20,6 +21,7 @@ from softwarp.model.gradients import (
     MEMORIES,
     MODES,
     STATE,
+    Ends,
     Gradients,
 )
 from softwarp.model.model import Model
@@ -214,17 +216,16 @@ class DifferentiableWorlds:
             for each, part in zip(steppers, parts, strict=True)
             if not isinstance(each, RepeatingEuler)  # refused before
         ]
+        self._ends = self._hold_ends([(each, pull) for (each, _), pull in zip(twins, pulls, strict=True)])
         self._workers = workers = Workers(len(twins)) if len(twins) > 1 else None
         self._directions: Directions | RowDirections | None = None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._refresh = Replayed(model.device, [system.refresh for _, system in twins], workers)
         self._pull, self._prepare, self._pull_kept = (
             {
-                (parameters, forces): Replayed(
-                    model.device, [_launches(pull, of_pull, forces=forces) for pull in pulls], workers
-                )
+                (parameters, *way): Replayed(model.device, [_launches(pull, of_pull, *way) for pull in pulls], workers)
                 for parameters, of_pull in ((True, name), (False, f"{name}_alone"))
-                for forces in (True, False)
+                for way in product((True, False), repeat=3)
                 if hasattr(pulls[0], of_pull)
             }
             for name in ("step", "prepare", "pull")
@@ -244,6 +245,16 @@ class DifferentiableWorlds:
         self._unsure = [(at, _flags(part.contact.unsure)) for at, part in stages if part.contact is not None]
         held = [] if model.frames is None else model.frames.is_kinematic.nonzero()[0].tolist()
         self._kinematic = torch.tensor(held, dtype=torch.long, device=self.failed.device)
+
+    def _hold_ends(self, pulls: Sequence[tuple[slice, StepAdjoint | SecondOrderAdjoint]]) -> dict[str, torch.Tensor]:
+        """Views of what says where nodes are at the end of a step, for adjoints that go by that."""
+        if self.model.reduction is None or self.model.reduction.floating is None:
+            return {}
+        ends = create(Ends, self.model)
+        for each, pull in pulls:
+            if isinstance(pull, StepAdjoint) and pull.modes is not None and pull.modes.frames is not None:
+                pull.modes.frames.hold(worlds_slice(ends, each.start, each.stop))
+        return interop.views(ends, self.model)
 
     def start(self) -> None:
         """Take over state, commands and parameters of the simulation as they are now."""
@@ -376,6 +387,8 @@ class DifferentiableWorlds:
         *,
         parameters: bool = True,
         forces: bool = True,
+        velocities: bool = True,
+        end: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
         """Gradients by the end of the step from the present state become those by the present state, in place.
 
@@ -384,8 +397,16 @@ class DifferentiableWorlds:
             place: Where it is.
             parameters: Whether gradients by parameters are asked for, which else stay as they are.
             forces: Whether those by node forces and tractions are, which else need not be found.
+            velocities: Whether there may be some by velocities of nodes at the end of the step.
+            end: The state there, if it is at hand, which else floating frames find again.
         """
-        key = parameters, forces or self.model.reduction is None  # where it makes no difference
+        is_known = end is not None and bool(self._ends)
+        if end is not None:
+            for name, view in self._ends.items():
+                if velocities or name != "node_v":
+                    view.copy_(end[name])
+        follows = self.model.reduction is not None
+        key = parameters, forces or not follows, velocities or not follows, is_known
         if room is None:
             self._pull[key]()
             return
@@ -410,13 +431,19 @@ def _adjoint(
     return kind(steps.system, steps.h, gradients, index, rest=rest)
 
 
-def _launches(pull: StepAdjoint | SecondOrderAdjoint, name: str, *, forces: bool) -> Callable[[], None]:
-    """A method of an adjoint, with gradients by node forces or without."""
+def _launches(
+    pull: StepAdjoint | SecondOrderAdjoint, name: str, forces: bool, velocities: bool, is_end_known: bool
+) -> Callable[[], None]:
+    """A method of an adjoint, with gradients by node forces and from velocities of nodes or without."""
     method = getattr(pull, name)
 
     def launch() -> None:
         if isinstance(pull, StepAdjoint):
             pull.by_forces = forces
+            if pull.modes is not None:
+                pull.modes.by_velocities = velocities
+                if pull.modes.frames is not None:
+                    pull.modes.frames.is_end_known = is_end_known
         method()
 
     return launch

@@ -10,6 +10,14 @@ from softwarp.model.fields import batched
 
 
 @dataclass
+class Ends:
+    """Where the nodes of floating frames are at the end of a step, whose gradients turn with them."""
+
+    node_x: wp.array = batched("node", width=3, unit="m", doc="position")
+    node_v: wp.array = batched("node", width=3, unit="m/s", doc="velocity")
+
+
+@dataclass
 class Gradients:
     """What the adjoint of a step reads and writes.
 

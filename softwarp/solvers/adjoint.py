@@ -155,12 +155,18 @@ class StepAdjoint:
         lifts = self.frames is not None and self.frames.lifts
         turns = self.modes is not None and self.modes.frames is not None
         self._load(() if lifts or turns else without)
+        if lifts:
+            self._find_forces()
+        elif turns:
+            self.system.loads()
+            for term in self.system.terms:
+                if isinstance(term, TetTerm):  # some laws prepare their stiffness there
+                    term.forces()
         if lifts or turns:
             self._stiffen()
 
     def _stiffen(self) -> None:
-        """Forces of elements, and stiffness where it is stored, that carried nodes need."""
-        self._find_forces()
+        """Stiffness of elements, where it is stored, that carried nodes and floating frames need."""
         for term in self.system.terms:
             if isinstance(term, TetTerm):
                 term.tets.stiffness()
@@ -168,9 +174,12 @@ class StepAdjoint:
                 term.points.stiffness()
             elif isinstance(term, MembraneTerm):
                 term.stiffness()
-        for term in self.system.terms:
-            if isinstance(term, ReductionTerm) and term.frames is not None:
-                term.sample(drag=False)  # which the solution has
+        self._take_samples()
+
+    def _take_samples(self) -> None:
+        """Stiffness of elements in floating frames, in the world's axes, which that of A is not."""
+        if self.modes is not None and self.modes.frames is not None:
+            self.modes.term.take_samples()
 
     def _find_forces(self) -> None:
         self.system.forces()
@@ -203,6 +212,7 @@ class StepAdjoint:
         system.right_hand_side(h, inertia=True, moving=False)
         system.solve(h, h)
         system.add_unknowns()
+        self._take_samples()
         if self.contact is not None:  # which has been looked for where the step leads to
             self._start_over()
 
@@ -420,9 +430,10 @@ class StepAdjoint:
         s, m, w, h = self.shard, self.model, self.shard.work, self.h
         if not self.has_modes_alone:
             outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
-            s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+            inputs = [m.node_dof, m.node_volume, w.dof_v.S, self.p.S]
+            s.each(self.k.to_nodes, s.variant.parts(m.node_count), inputs, outputs)
         if self.modes is not None:
-            everywhere = self.by_forces or self.modes.frames is not None
+            everywhere = self.by_forces or (self.modes.frames is not None and s.variant.world_fastest)
             self.modes.place(w.dof_v, self.p, self.node_v, self.node_p, everywhere=everywhere)
         if self.frames is not None:
             self.frames.carry(self.p, self.node_v, self.node_p)
@@ -487,7 +498,8 @@ class StepAdjoint:
             self._to_modes(self.modes)
             return
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
-        s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
+        inputs += [self.corner.S, self.point.S]
+        s.each(self.k.node_sums, s.variant.parts(m.node_count), inputs, [self.node_bar.S])
         inputs = [self.h, s.lanes, m.node_body, i["density"].real]
         inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
         s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
@@ -496,7 +508,7 @@ class StepAdjoint:
             if self.modes.frames is not None:
                 if self.contact is not None:
                     self.contact.push_nodes(self.modes.frames.touch_p, self.modes.frames.touch_v)
-                self.modes.frames.to_state(self.index, self.p, self.q, self.corner)
+                self.modes.frames.to_state(self.index, self.p, self.modes.wide_p, self.q, self.corner)
         self._to_tractions()
 
     def _to_modes(self, modes: ModeAdjoint) -> None:
@@ -511,7 +523,7 @@ class StepAdjoint:
             s.each_real(self.k.node_forces, parts, inputs, [self.gradients.command_node_force])
             self._to_tractions()
         if modes.frames is not None:
-            modes.frames.to_state(self.index, self.p, self.q, self.corner)
+            modes.frames.to_state(self.index, self.p, modes.wide_p, self.q, self.corner)
 
     def _to_tractions(self) -> None:
         s, m, g = self.shard, self.model, self.gradients

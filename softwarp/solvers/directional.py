@@ -73,7 +73,8 @@ class StepDirection(StepAdjoint):
         """What all directions share of a solution, whose velocities and forces are in place."""
         s, m, w = self.shard, self.model, self.shard.work
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
-        s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+        inputs = [m.node_dof, m.node_volume, w.dof_v.S, self.p.S]
+        s.each(self.k.to_nodes, s.variant.parts(m.node_count), inputs, outputs)
         if not m.row_count:
             return
         self.find_activity()
@@ -166,11 +167,13 @@ class StepDirection(StepAdjoint):
         inputs += [i["v0"].real, w.dof_v.real, d["density"].real, d["rayleigh_mass"].real, d["node_v"].real]
         s.each_real(self.k_push.momenta, m.dof_count, inputs, [self.p.real])
         outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
-        s.each(self.k.to_nodes, m.node_count, [m.node_dof, m.node_volume, w.dof_v.S, self.p.S], outputs)
+        inputs = [m.node_dof, m.node_volume, w.dof_v.S, self.p.S]
+        s.each(self.k.to_nodes, s.variant.parts(m.node_count), inputs, outputs)
         if self.quadratic is not None:
             self.quadratic.add_mass(self.p, self.node_mass_p)
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
-        s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
+        inputs += [self.corner.S, self.point.S]
+        s.each(self.k.node_sums, s.variant.parts(m.node_count), inputs, [self.node_bar.S])
         inputs = [h, m.node_count, m.dof_node, m.dof_free, m.node_body, x.node_heft, i["density"].real]
         inputs += [i["gravity"].real, d["density"].real, d["gravity"].real, force.real]
         inputs += [self.node_mass_p.real, self.node_bar.real]

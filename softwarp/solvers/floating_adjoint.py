@@ -7,7 +7,6 @@ import warp as wp
 
 from softwarp.kernels.elements import adjoint as of_tets
 from softwarp.kernels.elements import (
-    adjoint_sums,
     floating_adjoint,
     floating_moment_adjoint,
     floating_pull,
@@ -15,13 +14,13 @@ from softwarp.kernels.elements import (
     samples,
 )
 from softwarp.model.floating import FloatingModel
-from softwarp.model.gradients import Gradients
+from softwarp.model.gradients import Ends, Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.element_adjoint import TetAdjoint
 from softwarp.solvers.membrane_adjoint import MembraneAdjoint
 from softwarp.solvers.terms.floating import FloatingFrames
 from softwarp.solvers.terms.reduction import ReductionTerm
-from softwarp.solvers.workspace.rows import Rows
+from softwarp.solvers.workspace.rows import Rows, alias
 from softwarp.solvers.workspace.shard import Shard
 
 
@@ -59,13 +58,15 @@ class Places:
             s.each(k.widen, r.wide_count, [r.wide_mode, values.S], [wide.S])
         s.each_real(self.frames.k.at_rest, self.model.count, [self.model.first_wide], [self.wide_q.real])
 
-    def place(self) -> None:
-        """All listed nodes and their velocities; needs ``widen``."""
+    def place(self, *, moves: bool) -> None:
+        """All listed nodes and, if it ``moves``, their velocities; needs ``widen``."""
         s, m, r, k = self.shard, self.model, self.term.model, self.frames.k
         self.term.place_both(r.node_rest, self.wide_q, self.wide_v, self.x, self.node_v)
         listed = [m.listed, m.listed_body, r.node]
         inputs = [int(r.node.size), *listed, self.turn.real, self.centre.real]
         s.each_real(k.place_nodes, int(m.listed.size), inputs, [self.x.real])
+        if not moves:
+            return
         inputs = [*listed, m.first, m.radius, self.turn.real, self.centre.real, self.v.real, self.x.real]
         s.each_real(k.node_velocities, int(m.listed.size), inputs, [self.node_v.real])
 
@@ -81,6 +82,7 @@ class FloatingAdjoint:
 
     Attributes:
         own_v, own_p: v and p of nodes as their elements feel them without turning.
+        is_end_known: Whether what ``hold`` has been told of says where nodes are at the end of the step.
         touch_p, touch_v: What contacts have by p and v of the nodes that touch something, behind those of dofs.
     """
 
@@ -91,7 +93,6 @@ class FloatingAdjoint:
         m, nodes = self.model, shard.model.node_count
         self.k, self.k_pull = floating_adjoint.kernels(shard.variant), floating_pull.kernels(shard.variant)
         self.k_moment = floating_moment_adjoint.kernels(shard.variant)
-        self.k_sums = adjoint_sums.kernels(shard.variant)
         self.start, self.end = Places(shard, term, m), Places(shard, term, m)
         moments = 9 * int(m.moment_body.size)
         self.moment, self.rate = shard.rows(moments), shard.rows(moments)
@@ -99,22 +100,37 @@ class FloatingAdjoint:
         self.q0_bar, self.q1_bar, self.nothing = (shard.rows(term.model.count) for _ in range(3))
         self.turn_bar, self.rigid = shard.rows(3 * m.count), shard.rows(9 * m.count)
         self.arm, self.no_arm = (shard.rows(3 * int(term.model.node.size)) for _ in range(2))
-        self.own_v, self.own_p, self.element_bar = (shard.rows(3 * nodes) for _ in range(3))
+        self.own_v, self.own_p = shard.rows(3 * nodes), shard.rows(3 * nodes)
         self.elastic, self.damped = (shard.rows(shard.model.body_count) for _ in range(2))
-        corners, points = shard.work.element_force.real.shape[1], max(len(shard.model.point_node), 1)
-        self.corner, self.no_point = shard.rows(corners), shard.rows(3 * points)
+        self.corner = shard.rows(shard.work.element_force.real.shape[1])
         self.parameter: list[Rows] = []
-        self.asks = True
+        self.asks, self.placed = True, int(term.model.node.size)
+        self.is_end_known = False
+        self._ends: list[tuple[wp.array, Rows]] = []
         touch = np.full(int(term.model.node.size), -1)
         touch[term.model.touch_listed.numpy()] = np.arange(int(term.model.touch_listed.size))
         self.listed_touch = wp.array(touch, dtype=wp.int32, device=shard.device)
         self.touch_p, self.touch_v = (shard.rows(3 * shard.model.dof_room) for _ in range(2))
 
-    def find_places(self, *, arrives: bool) -> None:
+    def hold(self, ends: Ends) -> None:
+        """Nodes at the end of a step are in ``ends`` wherever ``is_end_known``."""
+        self._ends = [(ends.node_x, self.end.x), (ends.node_v, self.end.node_v)]
+
+    def _take_ends(self, *, moves: bool) -> None:
+        s = self.shard
+        for array, target in self._ends if moves else self._ends[:1]:
+            if s.variant.lanes > 1:
+                inputs = [array, s.world_count, s.lanes]
+                s.each_real(s.k_state.interleave, None, inputs, [target.real])
+            else:
+                target.copy_from(alias(s.variant, array))
+
+    def find_places(self, *, arrives: bool, moves: bool = True) -> None:
         """Where all nodes were and are; needs the solution of the step.
 
         Args:
             arrives: Whether bodies turn on as at the end of a step, with their momentum, and not as in a look ahead.
+            moves: Whether velocities of nodes at the end matter.
         """
         s, m, r, i, w = self.shard, self.model, self.term.model, self.shard.input, self.shard.work
         start, end, k = self.start, self.end, self.start.frames.k_inertia
@@ -128,15 +144,18 @@ class FloatingAdjoint:
         end.frame(self.h)
         end.widen()
         if not arrives:
-            end.place()
+            end.place(moves=moves)
             return
         for wide, target in ((end.wide_q, self.moment), (end.wide_v, self.rate)):
             inputs = [m.moment_first, m.moment_wide, m.moment_stride, m.moments, wide.S]
             s.each(k.moments, int(m.moment_body.size), inputs, [target.S])
         outputs = [end.v.real, end.turn.real]
         s.each_real(k.turn_on, m.count, [*self._motion(), *self._moments(), self.h], outputs)
+        if self.is_end_known:
+            self._take_ends(moves=moves)
+            return
         end.widen()
-        end.place()
+        end.place(moves=moves)
 
     def _motion(self) -> list[wp.array]:
         m, i, w = self.model, self.shard.input, self.shard.work
@@ -151,12 +170,22 @@ class FloatingAdjoint:
         s, outputs = self.shard, [self.gradients.mode_turn, self.turn_bar.real]
         s.each_real(self.k.take_turns, self.model.count, [s.lanes, self.end.turn.real], outputs)
 
-    def turn_bars(self, by_x: Rows, by_v: Rows, *, at_end: bool) -> None:
-        """Gradients by listed nodes go to the axes of their bodies; what is of the frames is kept aside."""
+    def turn_bars(self, by_x: Rows, by_v: Rows | None, *, at_end: bool) -> None:
+        """Gradients by listed nodes go to the axes of their bodies; what is of the frames is kept aside.
+
+        Args:
+            by_x: Gradients by places.
+            by_v: By velocities; None where there are none.
+            at_end: Whether nodes are those of the end of the step.
+        """
         s, m, at = self.shard, self.model, self.end if at_end else self.start
-        inputs = [m.listed_start, m.listed, self.term.model.node, m.first, m.radius]
-        inputs += [at.turn.real, at.centre.real, at.x.real, at.node_v.real, at.v.real]
-        inputs.append((self.no_arm if at_end else self.arm).real)
+        arm = self.no_arm if at_end else self.arm
+        inputs = [m.listed_start, m.listed, self.term.model.node]
+        if by_v is None:
+            inputs += [at.turn.real, at.centre.real, at.x.real, arm.real]
+            s.each_real(self.k.place_bars, m.count, inputs, [by_x.real, self.rigid.real, self.turn_bar.real])
+            return
+        inputs += [m.first, m.radius, at.turn.real, at.centre.real, at.x.real, at.node_v.real, at.v.real, arm.real]
         outputs = [by_x.real, by_v.real, self.rigid.real, self.turn_bar.real]
         s.each_real(self.k.node_bars, m.count, inputs, outputs)
 
@@ -193,12 +222,13 @@ class FloatingAdjoint:
         inputs += [m.first, m.modes, moment_bar.real, mode_bar.real]
         s.each_real(self.k_moment.moment_bars, int(m.moment_body.size), inputs, [bar])
 
-    def place(self, p: Rows, node_v: Rows, node_p: Rows) -> None:
-        """Velocities and p of nodes, from what modes have in the axes of their bodies."""
+    def place(self, p: Rows, node_v: Rows, node_p: Rows, count: int) -> None:
+        """Velocities and p of the first ``count`` listed nodes, from what modes have in the axes of their bodies."""
         s, m, at = self.shard, self.model, self.start
         self.own_v.copy_from(node_v)
         self.own_p.copy_from(node_p)
-        inputs = [m.listed, m.listed_body, self.term.model.node, m.block, self.term.model.mode_dof, m.radius]
+        self.placed = count
+        inputs = [count, m.listed, m.listed_body, self.term.model.node, m.block, self.term.model.mode_dof, m.radius]
         inputs += [at.turn.real, at.centre.real, at.x.real, s.work.dof_v.real, p.real]
         outputs = [self.own_v.real, self.own_p.real, node_v.real, node_p.real]
         s.each_real(self.k.turn_fields, s.variant.parts(int(m.listed.size)), inputs, outputs)
@@ -229,27 +259,28 @@ class FloatingAdjoint:
         inputs, outputs = [w.body_stiffness.real, w.body_damping.real], [self.elastic.real, self.damped.real]
         s.each_real(k.split_stiffness, s.model.body_count, inputs, outputs)
         self.asks = parameters
-        held: list[tuple[Rows, Rows, int, int]] = [(corner, self.corner, 1, -1)]
+        held: list[tuple[Rows, int, int]] = []
         if tets is not None and parameters:
-            held.append((tets.parameter, tets.parameter, of_tets.ROWS, of_tets.PARAMETERS))
+            held.append((tets.parameter, of_tets.ROWS, of_tets.PARAMETERS))
         if skin is not None and parameters:
-            held.append((skin.parameter, skin.parameter, membrane_adjoint.PARAMETERS, 2))
+            held.append((skin.parameter, membrane_adjoint.PARAMETERS, 2))
         if len(self.parameter) < len(held):
-            self.parameter = [s.rows(part.real.shape[1]) for part, _, _, _ in held]
-        for v, along, stiffness, h in (
-            (self.own_v, self.own_p, self.elastic, self.h),
-            (node_v, node_p, self.damped, 0.0),
+            self.parameter = [s.rows(part.real.shape[1]) for part, _, _ in held]
+        for v, along, stiffness, h, target in (
+            (self.own_v, self.own_p, self.elastic, self.h, self.corner),
+            (node_v, node_p, self.damped, 0.0, corner),
         ):
             if tets is not None:
-                tets.pull(v, along, stiffness, h, corner, parameters=parameters)
+                tets.pull(v, along, stiffness, h, target, parameters=parameters)
             if skin is not None:
-                skin.pull(v, along, stiffness, h, corner)
+                skin.pull(v, along, stiffness, h, target)
             if h > 0.0:
-                for (part, _, _, _), room in zip(held, self.parameter, strict=False):
+                for (part, _, _), room in zip(held, self.parameter, strict=False):
                     room.copy_from(part)
-        for (part, _, size, omit), room in zip(held, self.parameter, strict=False):
+        s.add(self.corner, corner, corner.real.shape[1])
+        for (part, size, omit), room in zip(held, self.parameter, strict=False):
             s.each_real(k.join, part.real.shape[1], [size, omit, room.real], [part.real])
-        given = [m.block, r.mode_dof, m.radius, w.body_damping.real, w.frame_axes.real]
+        given = [m.block, r.mode_dof, m.radius, w.body_damping.real]
         given += [node_v.real, node_p.real, w.dof_v.real, p.real]
         if tets is not None:
             inputs = [samples.TET, 0, r.tet_sample, m.tet_body, s.model.tet_node, s.model.tet_body, *given]
@@ -260,12 +291,13 @@ class FloatingAdjoint:
             inputs += [*given, w.thin_stiffness.real]
             s.each_real(k.drag_bars, int(m.tri_body.size), inputs, [corner.real])
 
-    def to_state(self, index: AdjointIndex, p: Rows, q: Rows, corner: Rows) -> None:
+    def to_state(self, index: AdjointIndex, p: Rows, wide_p: Rows, q: Rows, corner: Rows) -> None:
         """Gradients by velocities, turns and arms at the start, by density, Rayleigh's alpha and gravity.
 
         Args:
             index: Of the model.
             p: Adjoint of the velocities of dofs.
+            wide_p: Of wide modes.
             q: That of rows.
             corner: Gradients by corners of elements.
         """
@@ -290,12 +322,12 @@ class FloatingAdjoint:
         outputs += [self.turn_bar.real, self.start_bar.real, self.q0_bar.real]
         s.each_real(self.k_pull.turning_bars, None, inputs, outputs)
         points = [index.node_point_start, index.node_point, index.node_point_weight]
-        inputs = [s.model.corner_start, s.model.corner, *points, corner.S, self.no_point.S]
-        s.each(self.k_sums.node_sums, s.model.node_count, inputs, [self.element_bar.S])
-        inputs = [self.h, s.model.dof_count, m.listed_start, m.listed, self.listed_touch]
+        inputs = [self.h, s.model.dof_count, self.placed, m.listed_start, m.listed, self.listed_touch]
         inputs += [r.node, m.block, r.mode_dof, m.radius, *points, index.point_row]
-        inputs += [at.centre.real, at.x.real, self.own_v.real, self.own_p.real, w.dof_v.real, p.real]
-        inputs += [w.point_gradient.real, w.multiplier.real, q.real, w.node_external.real, self.element_bar.real]
+        inputs += [s.model.corner_start, s.model.corner, r.node_body, r.node_basis, r.body_wide, r.body_stride, r.basis]
+        inputs += [at.turn.real, wide_p.real, at.centre.real, at.x.real]
+        inputs += [self.own_v.real, self.own_p.real, w.dof_v.real, p.real]
+        inputs += [w.point_gradient.real, w.multiplier.real, q.real, w.node_external.real, corner.real]
         inputs += [self.touch_p.real, self.touch_v.real]
         s.each_real(self.k_pull.arm_bars, m.count, inputs, [self.arm.real, self.turn_bar.real])
 

@@ -168,8 +168,8 @@ class Looking(StepAdjoint):
     def _contacts_to_state(self, contact: ContactAdjoint) -> None:
         super()._contacts_to_state(contact)
         if self.comes_first and self.before is not None:
-            bar = self.gradients.node_v
-            self.shard.each_real(self.k_look.take_back, bar.shape[1], [self.shard.lanes, self.before], [bar])
+            s, bar = self.shard, self.gradients.node_v
+            s.each_real(self.k_look.take_back, s.variant.parts(bar.shape[1]), [s.lanes, self.before], [bar])
 
     def _look_back(self) -> None:
         """Gradients by where everything is at the end of the first solution's way."""

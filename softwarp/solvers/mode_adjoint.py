@@ -25,6 +25,10 @@ class ModeAdjoint:
         term: Their part in a step.
         h: Step [s].
         gradients: Arrays of these worlds.
+
+    Attributes:
+        is_lone: Whether all nodes follow modes and touch nothing.
+        by_velocities: Whether the end of a step may have gradients by velocities of nodes.
     """
 
     def __init__(self, shard: Shard, term: ReductionTerm, h: float, gradients: Gradients) -> None:
@@ -41,27 +45,32 @@ class ModeAdjoint:
         self.listed_v = shard.rows(3 * int(m.node.size))
         self.k_sums = adjoint_sums.kernels(shard.variant)
         self.frames = None if m.floating is None else FloatingAdjoint(shard, term, h, gradients)
-        self.is_lone = False
+        self.is_lone, self.by_velocities = False, True
 
-    def take(self, *, at_end: bool = False) -> None:
-        """Gradients by nodes, at the start of a step or at its end, become those by modes that they follow from."""
+    def take(self, *, at_end: bool = False, moves: bool = True) -> None:
+        """Gradients by nodes become those by modes that they follow from.
+
+        Args:
+            at_end: Whether these are those at the end of a step, and not at its start.
+            moves: Whether there may be some by velocities of nodes.
+        """
         s, m, g = self.shard, self.model, self.gradients
         if self.is_lone and not at_end:  # ``sum`` has those by positions, and there are no others
             if self.frames is not None:
-                self.listed_v.zero()
-                self.frames.turn_bars(self.listed, self.listed_v, at_end=False)
-                self._add(self.listed_v, g.mode_v)
+                self.frames.turn_bars(self.listed, None, at_end=False)
             self._add(self.listed, g.mode_q)
             return
         parts = s.variant.parts(int(m.node.size))
-        for by_nodes, listed in ((g.node_x, self.listed), (g.node_v, self.listed_v)):
+        taken = [(g.node_x, self.listed), (g.node_v, self.listed_v)]
+        for by_nodes, listed in taken if moves else taken[:1]:
             s.each_real(self.k.take_nodes, parts, [s.lanes, m.node], [by_nodes, listed.real])
         if self.frames is not None:
             if at_end:
                 self.frames.take_turns()
-            self.frames.turn_bars(self.listed, self.listed_v, at_end=at_end)
+            self.frames.turn_bars(self.listed, self.listed_v if moves else None, at_end=at_end)
         self._add(self.listed, g.mode_q)
-        self._add(self.listed_v, g.mode_v)
+        if moves:
+            self._add(self.listed_v, g.mode_v)
 
     def _add(self, listed: Rows, by_modes: wp.array) -> None:
         """by_modes += Phi' by listed nodes."""
@@ -87,9 +96,10 @@ class ModeAdjoint:
             y: Likewise.
             arrives: Whether that is the end, and not where a look ahead has been.
         """
+        moves = self.by_velocities or not arrives
         if self.frames is not None:
-            self.frames.find_places(arrives=arrives)
-        self.take(at_end=True)
+            self.frames.find_places(arrives=arrives, moves=moves)
+        self.take(at_end=True, moves=moves)
         if self.frames is not None and arrives:
             self.frames.turn_back()
         elif self.frames is not None:
@@ -102,7 +112,8 @@ class ModeAdjoint:
         """Gradients by listed nodes from those by corners and points; those behind the active ones have none."""
         s, m = self.shard, self.model
         self.listed.zero()
-        s.each(self.k_sums.listed_sums, m.active_count, [m.node, *sums], [self.listed.S])
+        inputs = [m.active_count, m.node, *sums]
+        s.each(self.k_sums.listed_sums, s.variant.parts(m.active_count), inputs, [self.listed.S])
 
     def place(self, v: Rows, p: Rows, node_v: Rows, node_p: Rows, *, everywhere: bool = True) -> None:
         """Velocities and p of nodes, from those of dofs.
@@ -120,7 +131,7 @@ class ModeAdjoint:
         count = int(m.node.size) if everywhere else m.active_count
         t.place_both(self.at_zero, self.wide_v, self.wide_p, node_v, node_p, count)
         if self.frames is not None:
-            self.frames.place(p, node_v, node_p)
+            self.frames.place(p, node_v, node_p, count)
 
     def to_state(self) -> None:
         """Gradients by the velocities at the start of the step; needs ``place``."""

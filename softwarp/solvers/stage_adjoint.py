@@ -171,7 +171,8 @@ class StageAdjoint(StepAdjoint):
                 inputs += [x.node_point_start, x.node_point, x.node_point_weight, i["pose0"].real]
                 s.each_real(self.k_stage.start_frames, f.model.count, [*inputs, self.start_point.real], [f.start.real])
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
-        s.each(self.k.node_sums, m.node_count, [*inputs, self.corner.S, self.point.S], [self.node_bar.S])
+        inputs += [self.corner.S, self.point.S]
+        s.each(self.k.node_sums, s.variant.parts(m.node_count), inputs, [self.node_bar.S])
         seed = self._meet()
         inputs = [self.h, self.follows, s.lanes, m.node_dof, m.node_body, m.dof_free]
         inputs += [x.node_point_start, x.node_point, x.node_point_weight]

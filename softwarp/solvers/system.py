@@ -210,6 +210,15 @@ class System:
         for term in self.terms:
             term.weigh()
 
+    def loads(self) -> None:
+        """External force of every node."""
+        s, m, i = self.shard, self.model, self.shard.input
+        inputs = [m.node_body, m.node_heft, m.node_load]
+        inputs += [i["density"].S, i["gravity"].S, i["command_node_force"].S]
+        s.each(self.k.node_loads, self.variant.parts(m.body_node_count), inputs, [self.work.node_external.S])
+        for term in self.terms:
+            term.weigh()
+
     def tangent(self) -> None:
         """A = m_scale M + k_scale K at the trial positions; needs ``forces``."""
         s, m, w = self.shard, self.model, self.work

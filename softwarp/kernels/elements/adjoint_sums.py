@@ -14,6 +14,7 @@ import warp as wp
 
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.elements import assembly
 from softwarp.kernels.elements.adjoint import PARAMETERS, ROWS
 
 
@@ -80,20 +81,27 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_p_out: wp.array2d(dtype=S),
         node_mass_p_out: wp.array2d(dtype=S),
     ):
-        """Velocity at the end of the step, adjoint p and lumped mass per density times p of one node; 0 if fixed."""
-        w, node = wp.tid()
+        """Velocity at the end of the step, adjoint p and lumped mass per density times p of one node; 0 if fixed.
+
+        On a CPU of all.
+        """
+        w, part = wp.tid()
         if wp.static(world_fastest):
-            node, w = wp.tid()
-        dof = node_dof[node]
-        for c in range(3):
-            v = S(real(0.0))
-            p = S(real(0.0))
-            if dof >= 0:
-                v = dof_v_in[w, 3 * dof + c]
-                p = dof_p_in[w, 3 * dof + c]
-            node_v_out[w, 3 * node + c] = v
-            node_p_out[w, 3 * node + c] = p
-            node_mass_p_out[w, 3 * node + c] = p * node_volume[node]
+            part, w = wp.tid()
+        first, last = rows_of(part, node_dof.shape[0])
+        for node in range(first, last):
+            dof = node_dof[node]
+            for c in range(3):
+                v = S(real(0.0))
+                p = S(real(0.0))
+                if dof >= 0:
+                    v = dof_v_in[w, 3 * dof + c]
+                    p = dof_p_in[w, 3 * dof + c]
+                node_v_out[w, 3 * node + c] = v
+                node_p_out[w, 3 * node + c] = p
+                node_mass_p_out[w, 3 * node + c] = p * node_volume[node]
+
+    corner_sum = assembly.kernels(variant).corner_sum
 
     @wp.func
     def sum_at(
@@ -110,14 +118,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         row_out: int,
     ):
         """Sum of the gradients by corners of elements and by points of rows that one node carries, into three rows."""
-        x = S(real(0.0))
-        y = S(real(0.0))
-        z = S(real(0.0))
-        for i in range(corner_start[node], corner_start[node + 1]):
-            row = 3 * corner[i]
-            x += corner_bar[w, row]
-            y += corner_bar[w, row + 1]
-            z += corner_bar[w, row + 2]
+        x, y, z = corner_sum(corner_bar, w, corner_start[node], corner_start[node + 1], corner)
         for i in range(node_point_start[node], node_point_start[node + 1]):
             row = 3 * node_point[i]
             weight = node_point_weight[i]
@@ -142,26 +143,29 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         node_bar_out: wp.array2d(dtype=S),
     ):
-        """See ``sum_at``."""
-        w, node = wp.tid()
+        """See ``sum_at``; of one node, on a CPU of all."""
+        w, part = wp.tid()
         if wp.static(world_fastest):
-            node, w = wp.tid()
-        sum_at(
-            node,
-            corner_start,
-            corner,
-            node_point_start,
-            node_point,
-            node_point_weight,
-            corner_bar_in,
-            point_bar_in,
-            w,
-            node_bar_out,
-            3 * node,
-        )
+            part, w = wp.tid()
+        first, last = rows_of(part, corner_start.shape[0] - 1)
+        for node in range(first, last):
+            sum_at(
+                node,
+                corner_start,
+                corner,
+                node_point_start,
+                node_point,
+                node_point_weight,
+                corner_bar_in,
+                point_bar_in,
+                w,
+                node_bar_out,
+                3 * node,
+            )
 
     @wp.kernel(module=module, enable_backward=False)
     def listed_sums(
+        count: int,
         # Model
         listed: wp.array(dtype=wp.int32),
         corner_start: wp.array(dtype=wp.int32),
@@ -175,23 +179,25 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         listed_bar_out: wp.array2d(dtype=S),
     ):
-        """The same of one node of a list, in its order."""
-        w, i = wp.tid()
+        """The same of one node of the first ``count`` of a list, in its order."""
+        w, part = wp.tid()
         if wp.static(world_fastest):
-            i, w = wp.tid()
-        sum_at(
-            listed[i],
-            corner_start,
-            corner,
-            node_point_start,
-            node_point,
-            node_point_weight,
-            corner_bar_in,
-            point_bar_in,
-            w,
-            listed_bar_out,
-            3 * i,
-        )
+            part, w = wp.tid()
+        first, last = rows_of(part, count)
+        for i in range(first, last):
+            sum_at(
+                listed[i],
+                corner_start,
+                corner,
+                node_point_start,
+                node_point,
+                node_point_weight,
+                corner_bar_in,
+                point_bar_in,
+                w,
+                listed_bar_out,
+                3 * i,
+            )
 
     @wp.kernel(module=module, enable_backward=False)
     def node_forces(

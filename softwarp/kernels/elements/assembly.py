@@ -148,6 +148,33 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 node_external_out[w, row + c] = external
 
     @wp.kernel(module=module, enable_backward=False)
+    def node_loads(
+        # Model
+        node_body: wp.array(dtype=wp.int32),
+        node_heft: wp.array(dtype=real),
+        node_load: wp.array2d(dtype=real),
+        # Workspace in
+        density_in: wp.array2d(dtype=S),
+        gravity_in: wp.array2d(dtype=S),
+        node_force_in: wp.array2d(dtype=S),
+        # Workspace out
+        node_external_out: wp.array2d(dtype=S),
+    ):
+        """Of ``node_forces`` the external force [N] alone."""
+        w, part = wp.tid()
+        first = int(0)
+        last = node_heft.shape[0]
+        if wp.static(world_fastest):
+            part, w = wp.tid()
+            first = part
+            last = part + 1
+        for node in range(first, last):
+            heavy = density_in[w, node_body[node]] * node_heft[node]
+            for c in range(3):
+                external = mul(heavy, gravity_in[w, c]) + S(node_load[node, c]) + node_force_in[w, 3 * node + c]
+                node_external_out[w, 3 * node + c] = external
+
+    @wp.kernel(module=module, enable_backward=False)
     def block_mass(
         # Model
         size: int,
@@ -393,7 +420,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         body_moduli=body_moduli,
         damping_scales=damping_scales,
         row_product=row_product,
+        corner_sum=corner_sum,
         node_forces=node_forces,
+        node_loads=node_loads,
         block_mass=block_mass,
         right_hand_side=right_hand_side,
         residual=residual,

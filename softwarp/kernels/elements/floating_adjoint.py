@@ -232,6 +232,38 @@ def kernels(variant: Variant) -> SimpleNamespace:
         add_to(turn_bar_out, pack, lane, 3 * f, by_turn)
 
     @wp.kernel(module=module, enable_backward=False)
+    def place_bars(
+        # Model
+        listed_start: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
+        node: wp.array(dtype=wp.int32),
+        # Workspace in
+        turn_in: wp.array3d(dtype=real),
+        centre_in: wp.array3d(dtype=real),
+        x_in: wp.array3d(dtype=real),
+        arm_bar_in: wp.array3d(dtype=real),
+        # Workspace out
+        x_bar_out: wp.array3d(dtype=real),
+        rigid_out: wp.array3d(dtype=real),
+        turn_bar_out: wp.array3d(dtype=real),
+    ):
+        """``node_bars`` where velocities of nodes have no gradients."""
+        pack, f, lane = wp.tid()
+        R = rotation(turn_in, pack, lane, f)
+        centre = vector_at(centre_in, pack, lane, 3 * f)
+        by_centre = vec3()
+        by_turn = vec3()
+        for item in range(listed_start[f], listed_start[f + 1]):
+            i = listed[item]
+            by_x = vector_at(x_bar_out, pack, lane, 3 * i)
+            by_r = by_x + vector_at(arm_bar_in, pack, lane, 3 * i)
+            by_centre += by_x
+            by_turn += wp.cross(vector_at(x_in, pack, lane, 3 * node[i]) - centre, by_r)
+            put(x_bar_out, pack, lane, 3 * i, wp.transpose(R) * by_r)
+        put(rigid_out, pack, lane, 9 * f, by_centre)
+        add_to(turn_bar_out, pack, lane, 3 * f, by_turn)
+
+    @wp.kernel(module=module, enable_backward=False)
     def rigid_bars(
         by_velocities: bool,
         # Model
@@ -456,6 +488,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def turn_fields(
+        last: int,
         # Model
         listed: wp.array(dtype=wp.int32),
         listed_body: wp.array(dtype=wp.int32),
@@ -475,7 +508,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_v_out: wp.array3d(dtype=real),
         node_p_out: wp.array3d(dtype=real),
     ):
-        """v and p of one listed node: what its modes have, in the world's axes, and all of it; on a CPU of all."""
+        """v and p of one listed node before ``last``: what its modes have, in the world's axes, and all of it.
+
+        On a CPU of all these.
+        """
         pack, part, lane = wp.tid()
         begin = int(0)
         end = listed.shape[0]
@@ -501,15 +537,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 w = vector_at(dof_v_in, pack, lane, about) / radius[f]
                 p = vector_at(dof_p_in, pack, lane, along)
                 q = vector_at(dof_p_in, pack, lane, about) / radius[f]
-            row = 3 * node[listed[item]]
-            r = vector_at(x_in, pack, lane, row) - c
-            turn_field(R, node_v_out, pack, lane, row, v, w, r, own_v_out, node_v_out)
-            turn_field(R, node_p_out, pack, lane, row, p, q, r, own_p_out, node_p_out)
+            if listed[item] < last:
+                row = 3 * node[listed[item]]
+                r = vector_at(x_in, pack, lane, row) - c
+                turn_field(R, node_v_out, pack, lane, row, v, w, r, own_v_out, node_v_out)
+                turn_field(R, node_p_out, pack, lane, row, p, q, r, own_p_out, node_p_out)
 
     return SimpleNamespace(
         take_turns=take_turns,
         give_turns=give_turns,
         node_bars=node_bars,
+        place_bars=place_bars,
         rigid_bars=rigid_bars,
         turn_back=turn_back,
         trial_back=trial_back,

@@ -186,7 +186,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         radius: wp.array(dtype=real),
         # Workspace in
         damping_scale_in: wp.array3d(dtype=real),
-        axes_in: wp.array3d(dtype=real),
         node_v_in: wp.array3d(dtype=real),
         node_p_in: wp.array3d(dtype=real),
         dof_v_in: wp.array3d(dtype=real),
@@ -199,11 +198,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, item, lane = wp.tid()
         f = sample_body[item]
         if f >= 0:
-            R = matrix_at(axes_in, pack, lane, 9 * f, 3)
             e = sample[item]
             about = 3 * mode_dof[block[f] + 1]
-            p_w = wp.transpose(R) * vector_at(dof_p_in, pack, lane, about) / radius[f]
-            w = wp.transpose(R) * vector_at(dof_v_in, pack, lane, about) / radius[f]
+            scale = -damping_scale_in[pack, body[f], lane] / radius[f]
+            p_w = scale * vector_at(dof_p_in, pack, lane, about)
+            w = scale * vector_at(dof_v_in, pack, lane, about)
             v0 = vector_at(node_v_in, pack, lane, 3 * corner[e, 0])
             p0 = vector_at(node_p_in, pack, lane, 3 * corner[e, 0])
             total = vec3()
@@ -213,9 +212,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 Kp = vec3()
                 for j in range(size // 3):
                     K = matrix_at(stiffness_in, pack, lane, size * size * item + 3 * (size * i + j), size)
-                    Kv += K * (wp.transpose(R) * (vector_at(node_v_in, pack, lane, 3 * corner[e, j + 1]) - v0))
-                    Kp += K * (wp.transpose(R) * (vector_at(node_p_in, pack, lane, 3 * corner[e, j + 1]) - p0))
-                found = R * (wp.cross(Kv, p_w) + wp.cross(Kp, w)) * (-damping_scale_in[pack, body[f], lane])
+                    Kv += K * (vector_at(node_v_in, pack, lane, 3 * corner[e, j + 1]) - v0)
+                    Kp += K * (vector_at(node_p_in, pack, lane, 3 * corner[e, j + 1]) - p0)
+                found = wp.cross(Kv, p_w) + wp.cross(Kp, w)
                 add_to(corner_out, pack, lane, row + 3 * (i + 1), found)
                 total += found
             add_to(corner_out, pack, lane, row, -total)
@@ -224,6 +223,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def arm_bars(
         h: real,
         dof_count: int,
+        last: int,
         # Model
         listed_start: wp.array(dtype=wp.int32),
         listed: wp.array(dtype=wp.int32),
@@ -236,7 +236,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_point: wp.array(dtype=wp.int32),
         node_point_weight: wp.array(dtype=real),
         point_row: wp.array(dtype=wp.int32),
+        corner_start: wp.array(dtype=wp.int32),
+        corner: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        node_basis: wp.array(dtype=wp.int32),
+        body_wide: wp.array(dtype=wp.int32),
+        body_stride: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=real),
         # Workspace in
+        turn_in: wp.array3d(dtype=real),
+        wide_p_in: wp.array3d(dtype=real),
         centre_in: wp.array3d(dtype=real),
         x_in: wp.array3d(dtype=real),
         own_v_in: wp.array3d(dtype=real),
@@ -247,7 +256,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         multiplier_in: wp.array3d(dtype=real),
         q_in: wp.array3d(dtype=real),
         external_in: wp.array3d(dtype=real),
-        element_bar_in: wp.array3d(dtype=real),
+        corner_bar_in: wp.array3d(dtype=real),
         touch_p_in: wp.array3d(dtype=real),
         touch_v_in: wp.array3d(dtype=real),
         # Workspace out
@@ -256,9 +265,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Gradients by the arms of one body's nodes and by its turn that rows, contacts and loads have.
 
-        Elements have none by a turn: what their gradients by nodes will have is taken off.
+        Elements have none by a turn: what their gradients by nodes will have is taken off. Listed nodes from ``last``
+        on have loads alone, and p is found where they do.
         """
         pack, f, lane = wp.tid()
+        R = wp.quat_to_matrix(wp.normalize(quat_at(turn_in, pack, lane, 4 * f)))
         centre = vector_at(centre_in, pack, lane, 3 * f)
         about = 3 * mode_dof[block[f] + 1]
         p_w = vector_at(dof_p_in, pack, lane, about) / radius[f]
@@ -268,6 +279,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             i = listed[item]
             row = 3 * node[i]
             along_p = h * vector_at(external_in, pack, lane, row)
+            if i >= last:
+                put(arm_bar_out, pack, lane, 3 * i, wp.cross(along_p, p_w))
+                if wp.length_sq(along_p) > real(0.0):
+                    stride = body_stride[node_body[i]]
+                    own = vec3()
+                    for k in range(stride):
+                        at = node_basis[i] + k
+                        shape = vec3(basis[at], basis[at + stride], basis[at + 2 * stride])
+                        own += wide_p_in[pack, body_wide[node_body[i]] + k, lane] * shape
+                    turn += wp.cross(R * own, along_p)
+                continue
             along_v = vec3()
             for entry in range(node_point_start[node[i]], node_point_start[node[i] + 1]):
                 point = node_point[entry]
@@ -281,7 +303,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             put(arm_bar_out, pack, lane, 3 * i, wp.cross(along_p, p_w) + wp.cross(along_v, w))
             turn += wp.cross(vector_at(own_p_in, pack, lane, row), along_p)
             turn += wp.cross(vector_at(own_v_in, pack, lane, row), along_v)
-            turn -= wp.cross(vector_at(x_in, pack, lane, row) - centre, vector_at(element_bar_in, pack, lane, row))
+            by_elements = vec3()
+            for entry in range(corner_start[node[i]], corner_start[node[i] + 1]):
+                by_elements += vector_at(corner_bar_in, pack, lane, 3 * corner[entry])
+            turn -= wp.cross(vector_at(x_in, pack, lane, row) - centre, by_elements)
         add_to(turn_bar_out, pack, lane, 3 * f, turn)
 
     @wp.kernel(module=module, enable_backward=False)

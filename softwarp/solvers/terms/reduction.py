@@ -94,8 +94,15 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.tangent()
 
-    def sample(self, *, drag: bool = True) -> None:
+    def sample(self) -> None:
         """Stiffness of the elements that count, and in floating frames what damping does where a body turns."""
+        self.take_samples()
+        if self.frames is not None:
+            self.frames.turn_stiffness()
+            self.frames.drag()
+
+    def take_samples(self) -> None:
+        """Stiffness of the elements that count, in the world's axes."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.tet_sample, m.tet_turned, s.model.tet_body, w.body_mu.S, w.body_lam.S, w.body_stiffness.S]
         inputs += [w.tet_gradient.S, w.tet_stiffness.S]
@@ -103,10 +110,6 @@ class ReductionTerm(Term):
         if s.model.membranes is not None:
             inputs = [m.tri_sample, s.model.membranes.element_body, w.body_stiffness.S, w.membrane_stiffness.S]
             s.each(self.k_sample.tri_stiffness, self.tris, inputs, [w.thin_stiffness.S])
-        if self.frames is not None:
-            self.frames.turn_stiffness()
-            if drag:
-                self.frames.drag()
 
     def _gather(self) -> None:
         """Their sum on a GPU."""

@@ -177,6 +177,24 @@ def test_world_of_a_batch_that_touches_has_the_gradient_of_that_world_alone(prec
     test_reduced.equal_alone(batch, single, given_of, loss)
 
 
+@pytest.mark.parametrize("on", ["", pytest.param("floor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("factors", [True, False])
+def test_what_else_is_asked_for_makes_no_difference(on: str, factors: bool) -> None:
+    """Of places by one command, with loads on all nodes: without velocities and with p at few nodes, and with all."""
+    sim = slab(on=on)
+    rollout, given = Rollout(sim), given_of(sim, [1])
+    assert given["controls"]["node_force"].abs().min() > 0.0
+    found = []
+    for names, velocities in ((("cavity_volume",), False), (("cavity_volume", "node_force"), True)):
+        controls = {name: value.clone().requires_grad_(name in names) for name, value in given["controls"].items()}
+        states = rollout(given["state"], controls, given["parameters"], factors=factors)
+        total = states.node_x.pow(3).sum() + states.mode_turn.pow(3).sum()
+        (total + 0.0 * states.node_v.sum() if velocities else total).backward()
+        found.append(controls["cavity_volume"].grad)
+    assert found[0] is not None and found[1] is not None and found[0].abs().max() > 0.0
+    np.testing.assert_allclose(found[0].numpy(), found[1].numpy(), rtol=1e-9, atol=1e-12 * float(found[1].abs().max()))
+
+
 def test_steps_are_those_of_the_simulation() -> None:
     """To the bit, from a turn that was given."""
     sim = slab()
