@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
+from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
 from softwarp.kernels.step import newton
 from softwarp.model import memory
 from softwarp.model.model import Model
@@ -23,19 +25,23 @@ class NewtonControl:
         system: Worlds to iterate.
         still: Keep the forces of contacts of worlds that have converged, too, and what their sweeps left, so that
             iterations of others change nothing there; their contacts are not worked on.
+        deepest: How deep [m] contacts of each pair may lie at no cost to an iterate's merit, unless the start lies
+            deeper, (pair,); contacts with compliance, and with None all, may lie anywhere.
 
     Attributes:
         left: 1 while worlds have not converged; of ``look_for_others``.
         spare: Not 0 in worlds that nobody asks for, which need not converge, where there are any; int, 1 row.
     """
 
-    def __init__(self, system: System, *, still: bool = False) -> None:
+    def __init__(self, system: System, *, still: bool = False, deepest: ArrayLike | None = None) -> None:
         self.system, self.shard = system, system.shard
         self.kernels = newton.kernels(system.variant)
         self.rounding = ROUNDING_FLOAT64 if system.model.precision == "float64" else ROUNDING_FLOAT32
         self.rounding_force = rounding_force(system.model)
         allocate, dofs = self.shard.rows, self.shard.dof_rows
         self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
+        real = system.variant.real
+        self.deepest = None if deepest is None else wp.array(deepest, dtype=real, device=self.shard.device)
         self.left = memory.zeros((1,), wp.int32, self.shard.device)
         still_rows = (*system.multipliers.contact_forces, system.work.residual) if still else ()
         self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
@@ -61,6 +67,12 @@ class NewtonControl:
         if first:
             s.check_finite(w.norm, 2)
         self.system.rows.measure_gaps()
+        contact = self.system.contact
+        if contact is not None and self.deepest is not None:
+            c = contact.contacts
+            inputs = [TOUCH_ROWS, DISTANCE, self.deepest, c.count.real, c.pair.real, c.compliance.real]
+            inputs += [contact.pairs.distance.real, contact.detector.touch.real]
+            s.each_real(self.kernels.measure_depth, None, inputs, [w.control.real])
         inputs = [first, tolerance, self.rounding, self.rounding_force * f_scale]
         inputs += [m.segment_count == 0, self.system.rows.count]
         inputs += [m.row_size, w.norm.real, w.gap.real]

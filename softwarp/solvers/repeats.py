@@ -9,12 +9,15 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from softwarp.kernels.algebra.lanes import LANE_COUNT
 from softwarp.kernels.step import repeats, stages
 from softwarp.model import memory
 from softwarp.model.fields import allocate, declarations
+from softwarp.model.handles import Telescope
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create
 from softwarp.solvers.implicit_euler import ImplicitEuler
@@ -28,6 +31,7 @@ FREE, LESS = 8, 0.7  # iterations that may do so in full, and what each further 
 # two sets of contacts that lead to each other
 SWINGS = (*[1.0] * FREE, *(LESS**k for k in range(1, ITERATIONS - FREE + 1)))
 TOLERANCE = 1e-3  # relative force imbalance that ends them
+DEEP = 0.5  # radii of a line that an iterate may lie in what it touches at no cost to its merit
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
 ON_GPU = (4, 8, 64)  # worlds of a batch for each place where steps are repeated
 
@@ -49,7 +53,7 @@ class Places:
         here = (create(State, model), create(Control, model), create(Parameters, model))
         options = twin_options(system.options, system.model.precision)
         self.twin = System(model, system.index, system.variant, here[0], here[1], here[2], options)
-        self.control = NewtonControl(self.twin, still=True)
+        self.control = NewtonControl(self.twin, still=True, deepest=deepest(system.model))
         self.newton = ImplicitEuler(self.twin, h, control=self.control, tells=False, swings=SWINGS, brief=True)
         self.inputs: list[tuple[wp.array, wp.array]] = []
         for whole, part in ((self.shard.control, here[1]), (self.shard.parameters, here[2])):
@@ -195,6 +199,19 @@ def twin_options(options: Options, precision: str) -> Options:
         recovery_time=0.0,
         repeat_swing=float("inf"),
     )
+
+
+def deepest(model: Model) -> NDArray[np.float64] | None:
+    """How deep [m] lines of telescopes may lie in what they touch at no cost, inf for other pairs of parts, (pair,)."""
+    if model.contact is None or model.frames is None:
+        return None
+    found = np.full(model.contact.count, np.inf)
+    for pair, parts in enumerate(model.contact.parts):
+        for part in parts:
+            if isinstance(part, Telescope):
+                radius = model.frames.rod_radius[model.rod_nodes(part)].min()
+                found[pair] = min(found[pair], DEEP * float(radius))
+    return found
 
 
 def _places(system: System) -> list[int]:

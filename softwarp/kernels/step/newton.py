@@ -11,11 +11,13 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 # Rows of the per-world control array
-MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, WITHIN, ROWS = range(12)
+MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, WITHIN = range(11)
+DEPTH, DEPTH_FIRST, ROWS = range(11, 14)  # of the present iterate and the first one
 PROGRESS = 0.8  # of the best merit: what counts as an improvement
 PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
 REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A after a solve that failed or did not
 LEAST_SHARE = 0.1  # below it the tangent is left out for the rest of the step
+DEPTH_MERIT = 0.1  # what each unit of an iterate's depth beyond the first one adds to its merit
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -43,6 +45,33 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(IMPROVED), lane] = real(0.0)
         control_out[pack, wp.static(RETURNING), lane] = real(0.0)
         control_out[pack, wp.static(WITHIN), lane] = real(0.0)
+        control_out[pack, wp.static(DEPTH), lane] = real(0.0)
+        control_out[pack, wp.static(DEPTH_FIRST), lane] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def measure_depth(
+        touch_rows: int,
+        distance_row: int,
+        # Model
+        pair_deepest: wp.array(dtype=real),
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        pair_in: wp.array3d(dtype=wp.int32),
+        compliance_in: wp.array3d(dtype=real),
+        pair_distance_in: wp.array3d(dtype=real),
+        touch_in: wp.array3d(dtype=real),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+    ):
+        """Depth of the present iterate: the largest of its rigid contacts, in parts of the deepest of their pair."""
+        pack, lane = wp.tid()
+        depth = real(0.0)
+        for contact in range(count_in[pack, 0, lane]):
+            if compliance_in[pack, contact, lane] == real(0.0):
+                pair = pair_in[pack, contact, lane]
+                distance = touch_in[pack, touch_rows * contact + distance_row, lane]
+                depth = wp.max(depth, (pair_distance_in[pack, pair, lane] - distance) / pair_deepest[pair])
+        control_out[pack, wp.static(DEPTH), lane] = depth
 
     @wp.kernel(module=module, enable_backward=False)
     def judge(
@@ -74,6 +103,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
         search is not ``monotone`` patience never ends.
         A world whose last solve failed has not converged: it stands where it did, and forces balance at a saddle too.
+        Imbalance knows nothing of a wall that contacts of the iterate before have not held back from. So a depth beyond
+        1, and beyond that of the start, adds to the merit by which an iterate is best or has converged.
         """
         pack, lane = wp.tid()
         imbalance = norm_in[pack, 0, lane]
@@ -92,6 +123,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         stall = control_out[pack, wp.static(STALL), lane]
         patient = stall < real(wp.static(PATIENCE)) or not monotone
         accepted = first or imbalance <= before or ((patient or step < real(0.1)) and wp.isfinite(imbalance))
+        depth = control_out[pack, wp.static(DEPTH), lane]
+        if first:
+            control_out[pack, wp.static(DEPTH_FIRST), lane] = depth
+        beyond = wp.max(depth - wp.max(real(1.0), control_out[pack, wp.static(DEPTH_FIRST), lane]), real(0.0))
+        deep = real(wp.static(DEPTH_MERIT)) * beyond
         improved = first
         returning = bool(False)
         was_solved = control_out[pack, wp.static(FAILED), lane] < real(0.5)
@@ -105,13 +141,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
             control_out[pack, wp.static(WITHIN), lane] = wp.where(is_rounding, real(1.0), real(0.0))
             if not first:
                 stall += real(1.0)
-                if merit < real(wp.static(PROGRESS)) * control_out[pack, wp.static(BEST), lane]:
-                    control_out[pack, wp.static(BEST), lane] = merit
+                if merit + deep < real(wp.static(PROGRESS)) * control_out[pack, wp.static(BEST), lane]:
+                    control_out[pack, wp.static(BEST), lane] = merit + deep
                     stall = real(0.0)
                     improved = True
                 control_out[pack, wp.static(STALL), lane] = stall
                 is_still = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
-                if was_solved and (merit <= tolerance or is_still):
+                if was_solved and (merit + deep <= tolerance or (is_still and deep <= tolerance)):
                     control_out[pack, wp.static(FROZEN), lane] = real(1.0)
                 elif monotone and stall == real(wp.static(PATIENCE)):
                     returning = True
@@ -294,6 +330,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         look_for_others=look_for_others,
         hold_still=hold_still,
         begin=begin,
+        measure_depth=measure_depth,
         judge=judge,
         keep=keep,
         keep_best=keep_best,

@@ -1,10 +1,11 @@
-"""Per-world control of Newton's method: what a failed solve leaves is dropped, in its world alone."""
+"""Per-world control of Newton's method: what a failed solve leaves, and what lies deep, is dropped in its world."""
 
 import numpy as np
 import pytest
 
 import softwarp as sw
 from softwarp import meshing
+from softwarp.kernels.collision.geometry import DISTANCE, TOUCH_ROWS
 from softwarp.kernels.step import newton
 from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.relaxation import Relaxation
@@ -137,3 +138,40 @@ def test_rounding_is_told_of_iterates_that_do_not_settle(control: NewtonControl)
     for _ in range(6):
         control.judge(first=False, tolerance=1e-13, f_scale=1.0)
     assert not relaxation.balanced()[1]
+
+
+def lie(control: NewtonControl, depths: list[float]) -> None:
+    """Place contacts of each world in parts of the deepest that they may lie."""
+    contact, deepest = control.system.contact, control.deepest
+    assert contact is not None and deepest is not None
+    distance = contact.pairs.distance.real.numpy()[:, :1, :] - np.array(depths)[:, None, None] * deepest.numpy()[0]
+    touch = contact.detector.touch.real.numpy()
+    touch[:, DISTANCE::TOUCH_ROWS] = distance
+    put(contact.detector.touch, touch)
+
+
+def test_what_lies_deep_is_worse_by_that(control: NewtonControl) -> None:
+    """Forces may balance there: it has not converged, and is not the best where another has a little more imbalance.
+
+    Worlds: one that comes out of the wall with such a one, one with far more, one that began as deep.
+    """
+    system, work = control.system, control.system.work
+    control = NewtonControl(system, deepest=[1e-3])
+    control.begin()
+    runs = (
+        ([0.0, 0.0, 3.0], [1.0, 1.0, 1.0]),  # depths and relative imbalances
+        ([3.0, 3.0, 2.9], [1e-4, 1e-4, 0.5]),
+        ([0.9, 0.9, 2.9], [0.1, 0.4, 1e-4]),
+    )
+    told = []
+    for number, (depths, imbalances) in enumerate(runs):
+        lie(control, depths)
+        norm = np.broadcast_to(np.array([(value, 1.0) for value in imbalances])[:, :, None], work.norm.real.shape)
+        put(work.norm, norm.copy())
+        control.judge(first=number == 0, tolerance=1e-3, f_scale=1.0)
+        rows = work.control.real.numpy()[:, :, 0]
+        told.append(rows[:, [newton.IMPROVED, newton.ACCEPTED, newton.FROZEN]].astype(bool).T.tolist())
+    improved, accepted, frozen = zip(*told, strict=True)
+    assert improved[1:] == ([True, True, True], [True, False, True])
+    assert accepted == ([True] * 3,) * 3
+    assert frozen == ([False] * 3, [False] * 3, [False, False, True])
