@@ -8,13 +8,16 @@ from typing import Any
 import torch
 
 from softwarp.gradients.frame_equilibrium import by_turn
+from softwarp.gradients.mixing import Mixing
 from softwarp.gradients.refusals import Diverged
 from softwarp.gradients.resting import RestingWorlds
 from softwarp.simulation import Simulation
 
 Tensors = Mapping[str, torch.Tensor]
 LONG = 1.0e3  # s, of a step without momentum, whose matrix is the tangent of the forces to rounding
-STEPS = 30  # such steps, at most
+STEPS = 60  # such steps, at most
+SLOW = 0.5  # share of a step, or of what an adjoint leaves, from which the next one goes on from combinations of the last
+NEAR = 1.0e-3  # way of a step, up to which these are combined
 CORRECTIONS = 100  # of an adjoint, at most
 WAY = {"float32": 3.0e-6, "float64": 1.0e-11}  # extents, and rad, of the last step
 LEFT = {"float32": 1.0e-4, "float64": 1.0e-12}  # of a gradient: what an adjoint may leave
@@ -29,6 +32,8 @@ class CarriedWorlds(RestingWorlds):
     cables: products R' p are those of the adjoint of a step, and K's factor corrects what they leave,
 
         p += K^-1 (y + R' p).
+
+    Where K is far from R, as under large loads, both go on from combinations of their last steps: ``mixing``.
 
     Args:
         sim: Soft bodies beside rods and rigid bodies; cables under force control.
@@ -103,22 +108,45 @@ class CarriedWorlds(RestingWorlds):
 
     def _polish(self, limit: float) -> torch.Tensor:
         """Steps without momentum, of every world until one goes nowhere; which ones came to that."""
-        places = {name: self.state[name].clone() for name in PLACES}
         arrived = torch.zeros(self.model.num_worlds, dtype=torch.bool, device=self._free.device)
+        mixing, slow, last = Mixing(len(arrived)), arrived, torch.full_like(self.state["time"], torch.inf)
         for _ in range(STEPS):
+            before = {name: self.state[name].clone() for name in PLACES}
             self._rest()
             self._step()
-            way = (self.state["node_x"] - places["node_x"]).flatten(1).abs().amax(dim=1) / self.model.extent
-            turn = (self.state["frame_pose"] - places["frame_pose"])[..., 3:].flatten(1).abs().amax(dim=1)
-            for name, value in places.items():
+            way = (self.state["node_x"] - before["node_x"]).flatten(1).abs().amax(dim=1) / self.model.extent
+            turn = (self.state["frame_pose"] - before["frame_pose"])[..., 3:].flatten(1).abs().amax(dim=1)
+            for name, value in before.items():
                 mask = arrived.reshape(-1, *[1] * (value.ndim - 1))
-                places[name] = torch.where(mask, value, self.state[name])
-                self.state[name].copy_(places[name])
-            arrived |= torch.maximum(way, turn) <= limit
+                self.state[name].copy_(torch.where(mask, value, self.state[name]))
+            size = torch.maximum(way, turn)
+            size = torch.where(self.state["status"] == 0, size, torch.inf)  # a step that fails goes nowhere either
+            arrived |= size <= limit
             if arrived.all():
                 break
+            slow, last = slow | (size > SLOW * last), size
+            going = slow & ~arrived & (size <= NEAR)
+            if going.any():
+                self._place(mixing.next(self._placed(before), self._placed(self.state), going), going)
         self._rest()
         return arrived
+
+    def _placed(self, places: Tensors) -> torch.Tensor:
+        """Positions in extents and poses of every world, in a row."""
+        x, pose = places["node_x"], places["frame_pose"]
+        return torch.cat([each.flatten(1) for each in (x / self.model.extent, pose)], dim=1)
+
+    def _place(self, rows: torch.Tensor, going: torch.Tensor) -> None:
+        """Put some worlds where ``_placed`` tells them to be."""
+        mask = going[:, None, None]
+        x, pose = self.state["node_x"], self.state["frame_pose"]
+        moved, posed = (
+            part.reshape(each.shape)
+            for part, each in zip(rows.split([x[0].numel(), pose[0].numel()], dim=1), (x, pose), strict=True)
+        )
+        x.copy_(torch.where(mask, moved * self.model.extent, x))
+        turned = torch.nn.functional.normalize(posed[..., 3:], dim=-1)
+        pose.copy_(torch.where(mask, torch.cat([posed[..., :3], turned], dim=-1), pose))
 
     # Gradients
 
@@ -173,9 +201,13 @@ class CarriedWorlds(RestingWorlds):
         size = y.abs().amax(dim=1)
         left, going = y, size > 0.0
         limit, before = LEFT[self.model.precision], size
+        mixing, slow = Mixing(len(y)), torch.zeros_like(going)
         for _ in range(CORRECTIONS):
-            self._put(torch.where(going[:, None], self.h * left, 0.0))
+            self._put(torch.where(going[:, None], self.h * left, 0.0), self._imbalance)
+            start = self._taken()
             self._correct()
+            if (slow & going).any():
+                self._put(mixing.next(start, self._taken(), slow & going), self._p)
             for name in PLACES:
                 self.gradients[name].zero_()
             self._multiply()
@@ -189,7 +221,7 @@ class CarriedWorlds(RestingWorlds):
                 return
             if bool((going & ~(now < 1.0e3 * size)).any()):
                 break
-            before = now
+            slow, before = slow | (now > SLOW * before), now
         worlds = (going & ~(before <= 1.0e2 * limit * size)).nonzero().flatten().tolist()
         if worlds:
             listed = ", ".join(map(str, worlds[:8])) + (" ..." if len(worlds) > 8 else "")
@@ -198,16 +230,25 @@ class CarriedWorlds(RestingWorlds):
                 "where something buckles; take milder commands, or a Rollout with damping that comes to rest"
             )
 
-    def _put(self, rows: torch.Tensor) -> None:
-        """Unknowns into the shards."""
+    def _put(self, rows: torch.Tensor, parts: list[torch.Tensor]) -> None:
+        """Unknowns, (world, 3 dof), into arrays of the shards, (pack, row, lane)."""
         begin = 0
-        for view, count in zip(self._imbalance, self._counts, strict=True):
+        for view, count in zip(parts, self._counts, strict=True):
             packs, _, lanes = view.shape
             part = rows.new_zeros((packs * lanes, rows.shape[1]))
             part[:count] = rows[begin : begin + count]
             view.zero_()
             view[:, : rows.shape[1]] = part.reshape(packs, lanes, -1).permute(0, 2, 1)
             begin += count
+
+    def _taken(self) -> torch.Tensor:
+        """p of all worlds, as ``_put`` takes it."""
+        size = self._free.numel()
+        parts = [
+            view[:, :size].permute(0, 2, 1).flatten(0, 1)[:count]
+            for view, count in zip(self._p, self._counts, strict=True)
+        ]
+        return torch.cat(parts)
 
 
 class AtRestTogether(torch.autograd.Function):
