@@ -16,7 +16,9 @@ from softwarp.simulation import Simulation
 Tensors = Mapping[str, torch.Tensor]
 LONG = 1.0e3  # s, of a step without momentum, whose matrix is the tangent of the forces to rounding
 STEPS = 60  # such steps, at most
-SLOW = 0.5  # share of a step, or of what an adjoint leaves, from which the next one goes on from combinations of the last
+SLOW = (
+    0.5  # share of a step, or of what an adjoint leaves, from which the next one goes on from combinations of the last
+)
 NEAR = 1.0e-3  # way of a step, up to which these are combined
 CORRECTIONS = 100  # of an adjoint, at most
 WAY = {"float32": 3.0e-6, "float64": 1.0e-11}  # extents, and rad, of the last step
