@@ -107,6 +107,19 @@ def test_reward_counts_axis_as_way(env):
     torch.testing.assert_close(reward, (before - after) / 0.01 + 1.0 / (1.0 + (after / 0.01) ** 2) - 0.01)
 
 
+def test_a_loose_grip_is_told():
+    """Nothing for a grasp of half a newton and more; its lack counts in shares of that, down to the weight."""
+    env = make(num_worlds=2, grip_weight=2.0, settle=False)
+    env.reset()
+    act(env, torch.zeros(2, CABLES))
+    none, told = torch.zeros(2), env.grip() > 0.5
+    assert told.all() and torch.equal(env.reward_terms(none[:, None], none)["grip"], none)
+    load = env.sim.contact_load
+    load *= torch.tensor([0.125, 0.0])[:, None, None] / env.grip()[:, None, None]
+    torch.testing.assert_close(env.reward_terms(none[:, None], none)["grip"], torch.tensor([-1.5, -2.0]))
+    assert env.reward_range == (-8.0, 1.0)
+
+
 @pytest.mark.slow
 def test_dropping_ends_the_episode():
     """Cables let go: the cup falls, the episode terminates with the penalty, and a new one starts in the grasp."""

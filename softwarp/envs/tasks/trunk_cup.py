@@ -13,7 +13,8 @@ Goal         workspace: a pose in which the grasp was seen to hold the cup, its 
              list: one of ``goal_list``, with the axis of the start
 Reward       shaped: progress (e_prev - e) / 10 mm, e = sqrt(d^2 + (28.6 mm * angle)^2);
              precision 1 / (1 + (e / 10 mm)^2);  effort -0.01 mean(a^2);  drop -5;  start="open": carry +0.1 of the
-             share of the cup's weight that the trunk carries
+             share of the cup's weight that the trunk carries;  ``grip_weight``: grip, down to its negative where the
+             contacts' loads add up to less than 0.5 N
              paper:  |start - goal|_2 - |cup - goal|_1 in millimetres;  success +1
 Ends         terminated on a failed world, when the cup is dropped, and on success if ``end_on_success``; truncated
              after 250 actions (12.5 s)
@@ -199,7 +200,7 @@ class TrunkCup(CableReach):
     def setup(self) -> None:
         """Allocate goals, commands and constants."""
         config, device = self.config, self.device
-        self.reward_range = (-1.0 - config.drop_penalty, 1.0 + config.carry_weight * self.is_open)
+        self.reward_range = (-1.0 - config.drop_penalty - config.grip_weight, 1.0 + config.carry_weight * self.is_open)
         self._bottom = torch.tensor(self.scene.bottom_markers, device=device)
         self._rim = torch.tensor(self.scene.rim_markers, device=device)
         self._long_points = slice(0, LONG_CABLES * STATIONS)
@@ -323,6 +324,10 @@ class TrunkCup(CableReach):
         dropped: Tensor = way.amin(dim=1) > self.config.drop_distance
         return dropped
 
+    def grip(self) -> Tensor:
+        """Sum of the loads of all contacts [N], shape (world,)."""
+        return in_order(length_of(self.sim.contact_load).unbind(dim=1)).to(torch.float32)
+
     def carried(self) -> Tensor:
         """Share of the cup's weight that the trunk carries, at most 1, shape (world,)."""
         force = self.sim.pair_force[:, self.scene.hold, 1].abs() / self._weight
@@ -359,6 +364,8 @@ class TrunkCup(CableReach):
         }
         if self.is_open:
             terms["carry"] = config.carry_weight * self.carried()
+        if config.grip_weight:
+            terms["grip"] = config.grip_weight * ((self.grip() / GRIP).clamp(max=1.0) - 1.0)
         if self.action_size:
             terms["effort"] = config.effort_weight * rewards.effort(action.clamp(-1.0, 1.0))
         return terms
@@ -392,7 +399,7 @@ class TrunkCup(CableReach):
             self.command - self._first_command,
             self.sim.cable_tension,
             stations[:, self._stations].flatten(1),
-            in_order(length_of(self.sim.contact_load).unbind(dim=1))[:, None],
+            self.grip()[:, None],
         )
         return {"observation": torch.cat(parts, dim=1).to(torch.float32) * self._scale}
 
