@@ -4,7 +4,8 @@ For every file: a docstring whose theory page exists, no print. For every kernel
 without defaults, in the order topology, parameters, state, control, workspace, outputs, each group under its comment
 (scalars may also stand first); thread indices on the first line, one of them the world; arrays named ``_in`` are never
 written, those named ``_out`` are, all others (model and schedules) are read only, also through functions; a comment at
-every atomic.
+every atomic. For every kernel and function: nothing that Warp hashes otherwise once it has compiled it, so that a
+module has one name in the cache whatever has been compiled before it.
 """
 
 import ast
@@ -33,6 +34,9 @@ GROUPS = (
 SUFFIX = {"State": "_in", "Control": "_in", "Workspace in": "_in", "Samples in": "_in"}
 SUFFIX |= {"State out": "_out", "Workspace out": "_out", "Samples out": "_out"}
 WORLD_NAMES = {"w", "world", "pack", "group", "sample"}  # packs and groups hold worlds; samples are not simulated
+# Constants of Warp, for which it takes local variables of the same name where it hashes what stands behind their dots.
+CONSTANTS = {"e", "inf", "ln2", "ln10", "log2e", "log10e", "nan", "phi", "pi", "half_pi", "tau"}
+CONSTANTS |= {name.upper() for name in CONSTANTS}
 WITHOUT_THEORY = {"transfer"}  # copies between memory layouts
 KERNEL_LINES = 120  # vectors are written out by component, because SIMD lanes take the place of scalars
 
@@ -201,6 +205,20 @@ def check_header(path: Path, tree: ast.Module) -> Iterator[tuple[int, str]]:
             yield 1, f"the page {page} does not exist"
 
 
+def check_hash(function: ast.FunctionDef) -> Iterator[tuple[int, str]]:
+    """What makes the hash of a function depend on whether Warp has compiled it before."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in CONSTANTS:
+            yield node.lineno, f"{node.value.id!r} is a constant of Warp: give the variable another name"
+        if not isinstance(node, ast.For):
+            continue
+        targets = {name.id for name in ast.walk(node.target) if isinstance(name, ast.Name)}
+        for call in (call for line in node.body for call in ast.walk(line) if isinstance(call, ast.Call)):
+            names = {name.id for name in ast.walk(call) if isinstance(name, ast.Name)}
+            if ast.unparse(call.func) == "wp.static" and names & targets:
+                yield call.lineno, f"wp.static of {sorted(names & targets)[0]!r} of a loop: index a vector of constants"
+
+
 def check(paths: list[Path]) -> list[Finding]:
     """All broken rules of some kernel files."""
     sources = {path: path.read_text(encoding="utf-8") for path in paths}
@@ -212,6 +230,8 @@ def check(paths: list[Path]) -> list[Finding]:
         found = [*check_header(path, tree), *check_calls(tree, notes)]
         for kernel in decorated(tree, "kernel"):
             found += [*check_arguments(kernel, notes, writes(kernel, written_by)), *check_body(kernel)]
+        for function in (*decorated(tree, "kernel"), *decorated(tree, "func")):
+            found += check_hash(function)
         findings += [Finding(path, line, message) for line, message in found]
     return sorted(findings, key=lambda finding: (finding.path, finding.line))
 

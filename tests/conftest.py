@@ -25,11 +25,8 @@ def rng() -> np.random.Generator:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with the file that waits for no other, and leave out the ``cuda`` tests where Warp finds no CUDA device.
-
-    Of two processes that begin with files which need the same kernels one would wait while the other compiles them.
-    """
-    items.sort(key=lambda item: item.path.name != BESIDE)
+    """Physics last, as the scheduler below likes it, and no ``cuda`` tests where Warp finds no CUDA device."""
+    items.sort(key=lambda item: (item.path.name != BESIDE, "physics" in item.path.parts))
     needs_cuda = [item for item in items if item.get_closest_marker("cuda")]
     if not needs_cuda:
         return
@@ -56,8 +53,18 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give out whole files, whose fixtures and kernels are made once, in their order: the longest come first."""
+    """Give out whole files, whose fixtures and kernels are made once, from both ends of their list.
+
+    Promises of environments and batches come first, physics last, and they need other kernels: of two processes that
+    begin with files which need the same ones, one would wait while the other compiles them. They meet at short files.
+    """
     from xdist.scheduler import LoadFileScheduling
 
+    class FromBothEnds(LoadFileScheduling):  # type: ignore[misc]
+        def _assign_work_unit(self, node: Any) -> None:
+            if self.nodes.index(node) % 2:
+                self.workqueue.move_to_end(next(reversed(self.workqueue)), last=False)
+            super()._assign_work_unit(node)
+
     config.option.loadscopereorder = False
-    return LoadFileScheduling(config, log)
+    return FromBothEnds(config, log)

@@ -31,7 +31,9 @@ PRIMARY = (
     "render_policy",
     "export_policy",
 )  # and those of runs
-CHOICES = [(group, option) for group, options in group_options().items() for option in options]
+OPTIONS = group_options()
+ALONE = [(group, option) for group in ("experiment", "planner", "preset") for option in OPTIONS[group]]
+TOGETHER = {group: OPTIONS[group] for group in ("algo", "logger", "network")}  # no choice of one hides one of another
 
 
 def train(*overrides):
@@ -44,20 +46,33 @@ def environment_of(experiment):
     return next((entry["override /env"] for entry in defaults if "override /env" in entry), "trunk")
 
 
-@pytest.mark.parametrize(("group", "option"), CHOICES)
+@pytest.mark.parametrize(("group", "option"), ALONE)
 def test_every_choice_composes(group, option):
-    """Each file of each group, with its environment's own checks; an environment needs no file, only its name."""
+    """Each file of these groups, with its environment's own checks."""
     if group == "planner":
         assert isinstance(compose("plan", PlanConfig, [f"planner={option}", "env=trunk"]).planner, PlannerConfig)
     elif group == "preset":
         planned = compose("plan", PlanConfig, [f"preset={option}"])
         assert option in ("none", f"{registry.spec(planned.env['name']).file_name}_{planned.planner.name}")
-    elif group == "env":
-        assert registry.spec(train(f"env={option}").env["name"]).file_name == option
     else:
-        chosen = environment_of(option) if group == "experiment" else "trunk"
-        composed = train(f"{group}={option}", f"env={chosen}")
+        chosen = environment_of(option)
+        composed = train(f"experiment={option}", f"env={chosen}")
         assert isinstance(composed, TrainConfig) and registry.spec(composed.env["name"]).file_name == chosen
+
+
+@pytest.mark.parametrize("place", range(max(map(len, TOGETHER.values()))))
+def test_every_choice_composes_with_others(place):
+    """Each file of the other groups, several in one composition."""
+    chosen = {group: options[place % len(options)] for group, options in TOGETHER.items()}
+    composed = train("env=trunk", *(f"{group}={option}" for group, option in chosen.items()))
+    assert isinstance(composed, TrainConfig) and composed.env["name"] == "Trunk"
+    assert chosen["algo"].startswith(composed.algo.name)
+
+
+def test_no_choice_is_left_out():
+    """An environment needs no file, only its name: each is composed with one of the experiments, and all groups are."""
+    assert {environment_of(option) for option in OPTIONS["experiment"]} == set(OPTIONS["env"])
+    assert set(OPTIONS) == {"env", *TOGETHER, *(group for group, _ in ALONE)}
 
 
 def test_every_primary_file_has_a_schema():

@@ -53,6 +53,12 @@ BAD = [
     ("world, marker = wp.tid()", "item, marker = wp.tid()", "no thread index is the world"),
     ("    put(marker_x_out, world,", "    wp.atomic_add(marker_x_out, world, 0,", "without a comment"),
     ('    """Copy the node of every marker."""\n', "", "without a docstring"),
+    ("    target[w, 0] = value\n", "    e = value\n    target[w, 0] = e.x\n", "'e' is a constant of Warp"),
+    (
+        "    target[w, 0] = value\n",
+        "    for k in range(3):\n        target[w, k] = wp.static(A[k])\n",
+        "wp.static of 'k'",
+    ),
 ]
 
 

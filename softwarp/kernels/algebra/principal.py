@@ -40,6 +40,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     real = variant.real
     mul, fma, div, sqrt, select = variant.mul, variant.fma, variant.div, variant.sqrt, variant.select
     least, tiny, refines = real(LEAST[real]), real(1.0e3 * LEAST[real] ** 0.5), real is wp.float64
+    powers = wp.types.vector(len(LARGEST), real)(*reversed(LARGEST))
     tenth = real(0.1 * (2.0**-23 if real is wp.float32 else 2.0**-52))  # of a rounding
     third, sixth = real(1.0 / 3.0), real(1.0 / 6.0)
     a = algebra(variant)
@@ -72,9 +73,9 @@ def functions(variant: Variant) -> SimpleNamespace:
     @wp.func
     def largest_root(r: S):
         """The largest x with x^3 - 3 x = 2 r, for r from 0 to 1."""
-        x = S(wp.static(real(LARGEST[-1])))
+        x = S(powers[0])
         for k in range(wp.static(len(LARGEST) - 1)):
-            x = fma(x, r, S(wp.static(real(LARGEST[-2 - k]))))
+            x = fma(x, r, S(powers[k + 1]))
         if wp.static(refines):
             square = mul(x, x)
             x = x - div(mul(x, square - S(real(3.0))) - r - r, mul(S(real(3.0)), square - S(real(1.0))))
@@ -145,18 +146,18 @@ def functions(variant: Variant) -> SimpleNamespace:
         t = div(g, d + select(d, t, -t) + select(d, S(least), S(-least)))
         c = div(one, sqrt(fma(t, t, one)))
         s = mul(t, c)
-        e = Axes()
-        e.m = m
-        e.m.xx = fma(size, pp - mul(t, pq), mean)
-        e.m.yy = fma(size, fma(t, pq, qq), mean)
-        e.m.zz = fma(size, root, mean)
-        e.m.xy = S(real(0.0))
-        e.m.xz = S(real(0.0))
-        e.m.yz = S(real(0.0))
-        e.x = subtract(scaled(p, c), scaled(q, s))
-        e.y = add(scaled(p, s), scaled(q, c))
-        e.z = n
-        return e
+        axes = Axes()
+        axes.m = m
+        axes.m.xx = fma(size, pp - mul(t, pq), mean)
+        axes.m.yy = fma(size, fma(t, pq, qq), mean)
+        axes.m.zz = fma(size, root, mean)
+        axes.m.xy = S(real(0.0))
+        axes.m.xz = S(real(0.0))
+        axes.m.yz = S(real(0.0))
+        axes.x = subtract(scaled(p, c), scaled(q, s))
+        axes.y = add(scaled(p, s), scaled(q, c))
+        axes.z = n
+        return axes
 
     @wp.func
     def larger_first(b: Matrix, v: Matrix):
@@ -196,8 +197,8 @@ def functions(variant: Variant) -> SimpleNamespace:
     def singular_values(F: Matrix):
         """F = U diag(s) V' with rotations U and V, and the sign of det F in the smallest s, which is the last."""
         t = transposed(F)
-        e = principal_axes(product_with_itself(t))
-        v = rows(e.x, e.y, e.z)
+        axes = principal_axes(product_with_itself(t))
+        v = rows(axes.x, axes.y, axes.z)
         b = matmul(v, t)
         # the shortest row goes last: (x, y), (y, z), (x, y)
         b, v = larger_first(b, v)
@@ -219,15 +220,15 @@ def functions(variant: Variant) -> SimpleNamespace:
     def stretches(F: Matrix):
         """The same where no stretch vanishes and a mirrored F may have any: U is F V diag(1/s), with no order kept."""
         t = transposed(F)
-        e = principal_axes(product_with_itself(t))
+        axes = principal_axes(product_with_itself(t))
         one = S(real(1.0))
         least_square = S(least)
-        last = sqrt(wp.max(e.m.zz, least_square))
+        last = sqrt(wp.max(axes.m.zz, least_square))
         r = Singular()
-        r.v = rows(e.x, e.y, e.z)
+        r.v = rows(axes.x, axes.y, axes.z)
         r.s = vector(
-            sqrt(wp.max(e.m.xx, least_square)),
-            sqrt(wp.max(e.m.yy, least_square)),
+            sqrt(wp.max(axes.m.xx, least_square)),
+            sqrt(wp.max(axes.m.yy, least_square)),
             select(dot(row_x(F), cross(row_y(F), row_z(F))), last, -last),
         )
         b = matmul(r.v, t)

@@ -46,8 +46,8 @@ def rotations(variant: Variant) -> SimpleNamespace:
     add, subtract, scaled, dot, cross, apply = a.add, a.subtract, a.scaled, a.dot, a.cross, a.apply
     is_double = real is wp.float64
     arc_terms = 12 if is_double else 5  # of atan(t)/t, t^2 < 0.04: below half a rounding error
-    series, _ = logarithm_series(real)
-    series_terms = len(series)
+    terms = logarithm_series(real)[0]
+    series_terms, series = len(terms), wp.types.vector(len(terms), real)(*reversed(terms))
 
     @wp.struct
     class Quaternion:
@@ -170,7 +170,7 @@ def rotations(variant: Variant) -> SimpleNamespace:
         for k in range(wp.static(series_terms)):
             ddc = mul(ddc, y) + dc
             dc = mul(dc, y) + c
-            c = mul(c, y) + S(real(wp.static(series[series_terms - 1 - k])))
+            c = mul(c, y) + S(series[k])
         pole = div(S(real(1.0)), S(real(wp.static(4.0 * pi * pi))) - y)
         motion = Motion()
         pole2 = mul(pole, pole)

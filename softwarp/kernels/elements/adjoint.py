@@ -82,8 +82,8 @@ def functions(variant: Variant) -> SimpleNamespace:
         m.xy = H[0, 1]
         m.xz = H[0, 2]
         m.yz = H[1, 2]
-        e = principal_axes(m)
-        return vec3(e.m.xx, e.m.yy, e.m.zz), dense(rows(e.x, e.y, e.z))
+        axes = principal_axes(m)
+        return vec3(axes.m.xx, axes.m.yy, axes.m.zz), dense(rows(axes.x, axes.y, axes.z))
 
     @wp.func
     def gradient_at(values: wp.array2d(dtype=real), tet: int, corner: int):

@@ -54,27 +54,27 @@ def functions(variant: Variant) -> SimpleNamespace:
         v = transposed(g)
         one = S(real(1.0))
         half = real(0.5)
-        e = Symmetric()
-        e.xx = dot(row_x(u), row_x(v)) - one
-        e.yy = dot(row_y(u), row_y(v)) - one
-        e.zz = dot(row_z(u), row_z(v)) - one
-        e.xy = dot_onto(dot(row_x(u), row_y(v)), row_y(u), row_x(v)) * half
-        e.xz = dot_onto(dot(row_x(u), row_z(v)), row_z(u), row_x(v)) * half
-        e.yz = dot_onto(dot(row_y(u), row_z(v)), row_z(u), row_y(v)) * half
-        return e
+        eps = Symmetric()
+        eps.xx = dot(row_x(u), row_x(v)) - one
+        eps.yy = dot(row_y(u), row_y(v)) - one
+        eps.zz = dot(row_z(u), row_z(v)) - one
+        eps.xy = dot_onto(dot(row_x(u), row_y(v)), row_y(u), row_x(v)) * half
+        eps.xz = dot_onto(dot(row_x(u), row_z(v)), row_z(u), row_x(v)) * half
+        eps.yz = dot_onto(dot(row_y(u), row_z(v)), row_z(u), row_y(v)) * half
+        return eps
 
     @wp.func
-    def stress(e: Symmetric, mu: S, lam: S):
+    def stress(eps: Symmetric, mu: S, lam: S):
         """2 mu eps + lam tr(eps) 1."""
         two_mu = mu + mu
-        pressure = mul(lam, e.xx + e.yy + e.zz)
+        pressure = mul(lam, eps.xx + eps.yy + eps.zz)
         s = Symmetric()
-        s.xx = mul(two_mu, e.xx) + pressure
-        s.yy = mul(two_mu, e.yy) + pressure
-        s.zz = mul(two_mu, e.zz) + pressure
-        s.xy = mul(two_mu, e.xy)
-        s.xz = mul(two_mu, e.xz)
-        s.yz = mul(two_mu, e.yz)
+        s.xx = mul(two_mu, eps.xx) + pressure
+        s.yy = mul(two_mu, eps.yy) + pressure
+        s.zz = mul(two_mu, eps.zz) + pressure
+        s.xy = mul(two_mu, eps.xy)
+        s.xz = mul(two_mu, eps.xz)
+        s.yz = mul(two_mu, eps.yz)
         return s
 
     @wp.func

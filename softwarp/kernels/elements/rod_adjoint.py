@@ -25,8 +25,8 @@ PARAMETERS = 3  # rows of a segment: by Young's modulus, by Poisson's ratio, by 
 def functions(variant: Variant) -> SimpleNamespace:
     """The logarithm of a turn, for one scalar type."""
     real, vec3 = variant.real, single.functions(variant).vec3
-    series, pole = logarithm_series(real)
-    terms = len(series)
+    coefficients, pole = logarithm_series(real)
+    terms, series = len(coefficients), wp.types.vector(len(coefficients), real)(*reversed(coefficients))
 
     @wp.func
     def slopes(y: real):
@@ -35,7 +35,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         dc = real(0.0)
         for k in range(wp.static(terms)):
             dc = dc * y + c
-            c = c * y + real(wp.static(series[terms - 1 - k]))
+            c = c * y + series[k]
         near = real(1.0) / (real(wp.static(pole)) - y)
         return c + real(2.0) * near, dc + real(2.0) * near * near
 

@@ -99,7 +99,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
         ``has_turned`` unless ``windup`` still holds the angles of ``before``.
         """
-        e = Equations()
+        equations = Equations()
         first = tubes.first_tube[item]
         count = tubes.first_tube[item + 1] - first
         n = tubes.pieces[item]
@@ -153,11 +153,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if yields:
                         lean = (moment[0] * x[k] + moment[1] * y[k]) / bending
                     lean = wp.max(lean, real(0.0)) * part
-                    e.f[k] = e.f[k] + push * (real(1.0) - t) - pull
-                    e.g[k] = e.g[k] + push * t + pull
-                    e.low[k, k] = e.low[k, k] + hold + lean * (real(1.0) - t) * (real(1.0) - t)
-                    e.high[k, k] = e.high[k, k] + hold + lean * t * t
-                    e.between[k, k] = e.between[k, k] + lean * t * (real(1.0) - t) - hold
+                    equations.f[k] = equations.f[k] + push * (real(1.0) - t) - pull
+                    equations.g[k] = equations.g[k] + push * t + pull
+                    equations.low[k, k] = equations.low[k, k] + hold + lean * (real(1.0) - t) * (real(1.0) - t)
+                    equations.high[k, k] = equations.high[k, k] + hold + lean * t * t
+                    equations.between[k, k] = equations.between[k, k] + lean * t * (real(1.0) - t) - hold
             bound = int(0)  # a line in contact keeps its curvature, which no tube's angle turns
             if yields:
                 bound = count
@@ -170,15 +170,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         if end_of == 1:
                             a = j
                             b = k
-                        e.low[a, a] = e.low[a, a] + weight * (real(1.0) - t) * (real(1.0) - t)
-                        e.high[a, a] = e.high[a, a] + weight * t * t
-                        e.between[a, a] = e.between[a, a] + weight * t * (real(1.0) - t)
-                        e.low[a, b] = e.low[a, b] - weight * (real(1.0) - t) * (real(1.0) - t)
-                        e.high[a, b] = e.high[a, b] - weight * t * t
-                        e.between[a, b] = e.between[a, b] - weight * t * (real(1.0) - t)
+                        equations.low[a, a] = equations.low[a, a] + weight * (real(1.0) - t) * (real(1.0) - t)
+                        equations.high[a, a] = equations.high[a, a] + weight * t * t
+                        equations.between[a, a] = equations.between[a, a] + weight * t * (real(1.0) - t)
+                        equations.low[a, b] = equations.low[a, b] - weight * (real(1.0) - t) * (real(1.0) - t)
+                        equations.high[a, b] = equations.high[a, b] - weight * t * t
+                        equations.between[a, b] = equations.between[a, b] - weight * t * (real(1.0) - t)
             s = stop
             rounds += 1
-        return e
+        return equations
 
     @wp.func
     def torque_at(pose: wp.array3d(dtype=real), wrench: wp.array3d(dtype=real), pack: int, lane: int, frame: int):
@@ -190,22 +190,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.func
     def kept_equations(kept: wp.array3d(dtype=real), pack: int, lane: int, segment: int):
         """Equations of a segment, as ``equate`` has left them."""
-        e = Equations()
+        equations = Equations()
         row = wp.static(EQUATION_ROWS) * segment
         for k in range(4):
-            e.f[k] = kept[pack, row + k, lane]
-            e.g[k] = kept[pack, row + 4 + k, lane]
+            equations.f[k] = kept[pack, row + k, lane]
+            equations.g[k] = kept[pack, row + 4 + k, lane]
         row += 8
         for k in range(4):
             for j in range(k + 1):
-                e.low[k, j] = kept[pack, row, lane]
-                e.low[j, k] = kept[pack, row, lane]
-                e.between[k, j] = kept[pack, row + 1, lane]
-                e.between[j, k] = kept[pack, row + 1, lane]
-                e.high[k, j] = kept[pack, row + 2, lane]
-                e.high[j, k] = kept[pack, row + 2, lane]
+                equations.low[k, j] = kept[pack, row, lane]
+                equations.low[j, k] = kept[pack, row, lane]
+                equations.between[k, j] = kept[pack, row + 1, lane]
+                equations.between[j, k] = kept[pack, row + 1, lane]
+                equations.high[k, j] = kept[pack, row + 2, lane]
+                equations.high[j, k] = kept[pack, row + 2, lane]
                 row += 3
-        return e
+        return equations
 
     @wp.func
     def gives_way(contact_count: wp.array2d(dtype=wp.int32), world: int):
@@ -239,7 +239,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, segment, lane = wp.tid()
         item = piece_telescope[segment]
         plan = wp.static(PLAN_ROWS) * item
-        e = segment_equations(
+        equations = segment_equations(
             tubes,
             materials,
             length_in,
@@ -258,14 +258,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         )
         row = wp.static(EQUATION_ROWS) * segment
         for k in range(4):
-            equations_out[pack, row + k, lane] = e.f[k]
-            equations_out[pack, row + 4 + k, lane] = e.g[k]
+            equations_out[pack, row + k, lane] = equations.f[k]
+            equations_out[pack, row + 4 + k, lane] = equations.g[k]
         row += 8
         for k in range(4):
             for j in range(k + 1):
-                equations_out[pack, row, lane] = e.low[k, j]
-                equations_out[pack, row + 1, lane] = e.between[k, j]
-                equations_out[pack, row + 2, lane] = e.high[k, j]
+                equations_out[pack, row, lane] = equations.low[k, j]
+                equations_out[pack, row + 1, lane] = equations.between[k, j]
+                equations_out[pack, row + 2, lane] = equations.high[k, j]
                 row += 3
 
     @wp.kernel(module=module, enable_backward=False)
@@ -323,14 +323,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 gradient[k] = spring * (windup_out[pack, angles + k * (n + 1), lane] - goal)
                 diagonal[k, k] = spring
             for place in range(n):
-                e = Equations()
+                equations = Equations()
                 if wp.static(side_by_side):
-                    e = kept_equations(equations_in, pack, lane, first_piece[item] + place)
+                    equations = kept_equations(equations_in, pack, lane, first_piece[item] + place)
                 else:
                     row = 2 * (first_piece[item] + place)
                     moment = vec2(load_in[pack, row, lane], load_in[pack, row + 1, lane])
                     twist = twist_in[pack, first_piece[item] + place, lane]
-                    e = segment_equations(
+                    equations = segment_equations(
                         tubes,
                         materials,
                         length_in,
@@ -348,8 +348,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         iteration > 0,
                     )
                 store = systems + wp.static(SYSTEM_ROWS) * place
-                diagonal = diagonal + e.low
-                gradient = gradient + e.f
+                diagonal = diagonal + equations.low
+                gradient = gradient + equations.f
                 if place > 0:  # the port takes what is given there
                     given = torque_at(pose_in, wrench_in, pack, lane, base_frame[item] + place)
                     gradient[carrier - first] = gradient[carrier - first] - given
@@ -358,13 +358,13 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         diagonal[k, k] = real(1.0)  # a tube that does not come here
                 inverse = inverted(diagonal)
                 rest = inverse * gradient
-                ahead = inverse * e.between
+                ahead = inverse * equations.between
                 for k in range(4):
                     system_out[pack, store + k, lane] = rest[k]
                     for j in range(4):
                         system_out[pack, store + 4 + 4 * k + j, lane] = ahead[k, j]
-                diagonal = e.high - wp.transpose(e.between) * ahead
-                gradient = e.g - wp.transpose(e.between) * rest
+                diagonal = equations.high - wp.transpose(equations.between) * ahead
+                gradient = equations.g - wp.transpose(equations.between) * rest
             given = torque_at(pose_in, wrench_in, pack, lane, base_frame[item] + n)
             gradient[carrier - first] = gradient[carrier - first] - given
             for k in range(4):
