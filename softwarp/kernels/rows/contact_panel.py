@@ -39,7 +39,8 @@ return value;
 """
 
 # Blocks of W of contacts first .. end - 1 with all up to them. Sums run over the dofs in order of their columns, as
-# paths do; a dof that is not on a path adds zeros. A lane of a warp has every 32nd of the other contacts.
+# paths do; a dof that is not on a path adds zeros. A lane of a warp has every 32nd of the other contacts, of which it
+# reads a dof's entries once for all contacts of its warp.
 _PRODUCTS = """
 #if defined(__CUDA_ARCH__)
 __shared__ SCALAR near[NEAR * (9 * DOFS + 1)];
@@ -57,6 +58,7 @@ const int own = first + thread / 32, lane = thread % 32;
 SCALAR sum[EACH][OTHERS][9] = {};
 for (int q = 0; q < size; q += DOFS) {
     const int dofs = size - q < DOFS ? size - q : DOFS;
+    #pragma unroll 4
     for (int e = thread; e < end * 9 * DOFS; e += THREADS) {
         const int c = e / (9 * DOFS), at = e % (9 * DOFS), d = at / 9;
         SCALAR value = 0;
@@ -67,25 +69,31 @@ for (int q = 0; q < size; q += DOFS) {
         near[c * STRIDE + at] = value;
     }
     MEET
-    for (int d = 0; d < dofs; ++d)
+    for (int d = 0; d < dofs; ++d) {
+        SCALAR a[EACH][9];
         #pragma unroll
         for (int i = 0; i < EACH; ++i) {
-            const int c = own + i * (THREADS / 32);
-            if (c >= end) continue;
-            SCALAR a[9];
+            const int c = own + i * (THREADS / 32) < end ? own + i * (THREADS / 32) : first;
             #pragma unroll
-            for (int k = 0; k < 9; ++k) a[k] = near[c * STRIDE + 9 * d + k];
+            for (int k = 0; k < 9; ++k) a[i][k] = near[c * STRIDE + 9 * d + k];
+        }
+        #pragma unroll
+        for (int m = 0; m < OTHERS; ++m) {
+            if (32 * m >= end) continue;
+            const SCALAR* const from = near + (lane + 32 * m < end ? lane + 32 * m : first) * STRIDE + 9 * d;
+            SCALAR b[9];
             #pragma unroll
-            for (int m = 0; m < OTHERS; ++m) {
-                const int other = lane + 32 * m;
-                if (other > c) continue;
-                const SCALAR* const b = near + other * STRIDE + 9 * d;
+            for (int k = 0; k < 9; ++k) b[k] = from[k];
+            #pragma unroll
+            for (int i = 0; i < EACH; ++i) {
+                if (32 * m > own + i * (THREADS / 32)) continue;
                 #pragma unroll
                 for (int r = 0; r < 9; r += 3)
                     #pragma unroll
-                    for (int k = 0; k < 9; ++k) sum[i][m][k] += a[r + k / 3] * b[r + k % 3];
+                    for (int k = 0; k < 9; ++k) sum[i][m][k] += a[i][r + k / 3] * b[r + k % 3];
             }
         }
+    }
     MEET
 }
 #pragma unroll
@@ -124,6 +132,7 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
     Sums = wp.types.vector(3 * axes, dtype=S)
     block = cholesky_panels.kernels(variant).block
     vec = wp.types.vector(3, dtype=S)
+    Side = wp.types.vector(9, dtype=S)
     Touch, first_dof, own_axes, mode_row = vars(touch.functions(variant)).values()
     slot_row, real = contact_rows.kernels(variant, together=True).slot_row, variant.real
 
@@ -224,7 +233,8 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
     ):
         """Y_c = P H_c' of one contact: ``scatter_rows`` of ``contact``, where threads share the modes of a body.
 
-        A block of modes has the same thread in every slot, and so has a dof that is none.
+        A block of modes has the same thread in every slot, which keeps its sum meanwhile, and so has a dof that is
+        none. Slots are filled from the first one on.
         """
         w, c, thread = wp.tid()
         if c < pack_first_in[w, 0] or c >= pack_count_in[w, 0]:
@@ -235,7 +245,11 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
             pack = int(0)
             lane = w
         start = 9 * c * path_limit
-        for slot in range(int(wp.static(SLOTS))):
+        held = int(-1)  # block whose entries are in ``side``
+        at = int(0)
+        side = Side()
+        slot = int(0)
+        while slot < wp.static(SLOTS):
             dof = dof_in[w, wp.static(SLOTS) * c + slot]
             if dof >= size:
                 node = dof - size
@@ -246,14 +260,21 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                 own1 = own_axes(modes, node, n1, pack, lane)
                 own2 = own_axes(modes, node, n2, pack, lane)
                 for p in range(modes.begin[node] + thread, modes.end[node], wp.static(SPREAD)):
-                    t = start + 9 * place_in[w, c * size + modes.dof[p]]
+                    if p != held:
+                        if held >= 0:
+                            for k in range(9):
+                                side_out[w, at + k] = side[k]
+                        held = p
+                        at = start + 9 * place_in[w, c * size + modes.dof[p]]
+                        for k in range(9):
+                            side[k] = side_out[w, at + k]
                     h0 = mode_row(modes, p, node, n0, own0, pack, lane)
                     h1 = mode_row(modes, p, node, n1, own1, pack, lane)
                     h2 = mode_row(modes, p, node, n2, own2, pack, lane)
                     for r in range(3):
-                        side_out[w, t + 3 * r] += h0[r]
-                        side_out[w, t + 3 * r + 1] += h1[r]
-                        side_out[w, t + 3 * r + 2] += h2[r]
+                        side[3 * r] += h0[r]
+                        side[3 * r + 1] += h1[r]
+                        side[3 * r + 2] += h2[r]
             elif dof >= 0 and dof % wp.static(SPREAD) == thread:
                 place = place_in[w, c * size + dof]
                 if place >= 0:
@@ -261,6 +282,10 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                         h = slot_row(weight_in, lever_in, axes_in, pack, lane, c, slot, axis)
                         for r in range(3):
                             side_out[w, start + 9 * place + 3 * r + axis] += h[r] * dof_free[dof, r]
+            slot = wp.where(dof < 0, wp.static(SLOTS), slot + 1)
+        if held >= 0:
+            for k in range(9):
+                side_out[w, at + k] = side[k]
 
     sizes = {"SCALAR": name_of(S), "DOFS": str(NEAR_DOFS[name_of(S)])}
     sizes |= {"NEAR": str(NEAR), "GROUP": str(NEAR_GROUP), "THREADS": str(THREADS)}
