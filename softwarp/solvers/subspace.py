@@ -99,3 +99,12 @@ class Subspace:
                 return
             inputs = [self.model.dof_count, r.mode_dof, r.block_touch, r.touch_begin, r.touch_stride, r.touch_basis]
             s.each(self.k.touch_forces, r.count // 3, [*inputs, r.basis, forces.S], [target.S])
+
+
+def each_load(shard: Shard, kernel: Any, modes: int, items: int, inputs: list[Any], outputs: list[Any]) -> None:
+    """Launch a kernel of ``mode_loads`` for some modes on a GPU, for some bodies or rows on a CPU."""
+    if not shard.variant.world_fastest:
+        shard.each(kernel, items, inputs, outputs)
+    elif modes:
+        parts, threads = mode_loads.team(shard.device, shard.width, modes)
+        wp.launch(kernel, threads, [parts, *inputs], outputs, device=shard.device)

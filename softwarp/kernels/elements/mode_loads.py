@@ -5,14 +5,36 @@ Theory: docs/theory/reduction.md.
 
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import mode_sums
+from softwarp.kernels.linear.cholesky_panels import exchange_code, name_of
 
 GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
 AHEAD = 4  # nodes whose forces it reads at once
+BESIDE = 8  # worlds of a warp, which so reads whole sectors of 32 bytes
+PARTS = 4  # threads that share the nodes of one world and some modes
+
+# Four entries of a row, to which a GPU's threads go with one access.
+_FOUR = """
+#if defined(__CUDA_ARCH__)
+struct alignas(16) Four { SCALAR x[4]; };
+const Four four = *(const Four*)(basis.data + at);
+for (int c = 0; c < 4; ++c) row.c[c] = four.x[c];
+#else
+for (int c = 0; c < 4; ++c) row.c[c] = basis.data[at + c];
+#endif
+return row;
+"""
+
+
+def team(device: Any, worlds: int, modes: int) -> tuple[int, int]:
+    """Threads that share the nodes of one world and some modes on a device, and those of a GPU's launch in all."""
+    parts = PARTS if wp.get_device(device).is_cuda else 1
+    return parts, modes // GROUP * -(-worlds // BESIDE) * BESIDE * parts
 
 
 @cache
@@ -129,26 +151,45 @@ def _by_bodies(host: Variant) -> SimpleNamespace:
 
 @cache
 def _by_modes(variant: Variant) -> SimpleNamespace:
-    """The same on a GPU: one thread for some modes, whose sums run over nodes in order.
+    """The same on a GPU: threads share the nodes for some modes of a world; their sums are added in a fixed order.
 
-    The warps of a block have the same 32 worlds, so that what one reads of a node is near for the others.
+    The warps of a block have the same worlds, so that what one reads of a node is near for the others.
     """
     S = variant.S
     module = variant.module("mode_loads")
     Row = wp.types.vector(GROUP, S)
     Forces = wp.types.vector(3 * AHEAD, S)
     Places = wp.types.vector(AHEAD, wp.int32)
+    Ahead = wp.types.vector(AHEAD, S)
+
+    @wp.func_native(_FOUR.replace("SCALAR", name_of(S)))
+    def four(basis: wp.array(dtype=S), at: int, row: Row) -> Row: ...
+
+    @wp.func_native(exchange_code(S))
+    def exchange(value: S, offset: int) -> S: ...
 
     @wp.func
-    def shared(item: int, w: int, items: int, worlds: int):
-        """Item and world of a thread, such that 32 worlds have all their items before the next 32."""
-        if worlds % 32 != 0:
-            return item, w
-        place = item * worlds + w
-        return place // 32 % items, place // 32 // items * 32 + place % 32
+    def seat(place: int, items: int, parts: int):
+        """Item, world and part of a thread: ``BESIDE`` worlds have all their items before the next."""
+        beside = place % wp.static(BESIDE)
+        rest = place // (wp.static(BESIDE) * parts)
+        world = rest // items * wp.static(BESIDE) + beside
+        return rest % items, world, place // wp.static(BESIDE) % parts
+
+    @wp.func
+    def whole(row: Row, parts: int):
+        """Sum of what the threads of a world and some modes have."""
+        total = row
+        offset = wp.static(BESIDE) * parts // 2
+        while offset >= wp.static(BESIDE):
+            for c in range(wp.static(GROUP)):
+                total[c] += exchange(total[c], offset)
+            offset = offset // 2
+        return total
 
     @wp.kernel(module=module, enable_backward=False)
     def add_forces(
+        parts: int,
         # Model
         body_node: wp.array(dtype=wp.int32),
         order: wp.array(dtype=wp.int32),
@@ -164,15 +205,15 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         wide_force_out: wp.array2d(dtype=S),
     ):
         """Add Phi' f over the nodes of their body to a group of wide modes; most nodes have no force at all."""
-        item, world = wp.tid()
-        items = wide_body.shape[0] // wp.static(GROUP)
-        group, w = shared(item, world, items, balance_in.shape[0])
+        place = wp.tid()
+        group, world, part = seat(place, wide_body.shape[0] // wp.static(GROUP), parts)
+        w = wp.min(world, balance_in.shape[0] - 1)  # all threads of a warp take part in its exchanges
         k = wp.static(GROUP) * group
         body = wide_body[k]
         stride = body_stride[body]
         last = body_node[body + 1]
         s = Row()
-        for p in range(body_node[body], last, wp.static(AHEAD)):
+        for p in range(body_node[body] + wp.static(AHEAD) * part, last, wp.static(AHEAD) * parts):
             f = Forces()
             at = Places()
             for n in range(wp.static(AHEAD)):  # unrolled: these loads do not wait for each other
@@ -188,13 +229,17 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
                 fz = f[3 * n + 2]
                 if fx * fx + fy * fy + fz * fz > S(0.0):
                     row = at[n] + k - body_wide[body]
-                    for c in range(wp.static(GROUP)):
-                        s[c] += fx * basis[row + c] + fy * basis[row + c + stride] + fz * basis[row + c + 2 * stride]
-        for c in range(wp.static(GROUP)):
-            wide_force_out[w, k + c] += s[c]
+                    s += four(basis, row, Row()) * fx
+                    s += four(basis, row + stride, Row()) * fy
+                    s += four(basis, row + 2 * stride, Row()) * fz
+        s = whole(s, parts)
+        if part == 0 and world < balance_in.shape[0]:
+            for c in range(wp.static(GROUP)):
+                wide_force_out[w, k + c] += s[c]
 
     @wp.kernel(module=module, enable_backward=False)
     def mode_rows(
+        parts: int,
         # Model
         row_body: wp.array(dtype=wp.int32),
         row_point: wp.array(dtype=wp.int32),
@@ -210,20 +255,27 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         wide_row_out: wp.array2d(dtype=S),
     ):
         """A group of wide modes of a row of H, from the gradient by its points."""
-        item, world = wp.tid()
-        items = wide_row.shape[0] // wp.static(GROUP)
-        group, w = shared(item, world, items, point_gradient_in.shape[0])
+        place = wp.tid()
+        group, world, part = seat(place, wide_row.shape[0] // wp.static(GROUP), parts)
+        w = wp.min(world, point_gradient_in.shape[0] - 1)
         k = wp.static(GROUP) * group
         row = wide_row[k]
         stride = body_stride[row_body[row]]
         at = row_basis[row] + k - row_wide[row]
         first = 3 * row_point[row]
+        last = 3 * row_points[row]
         s = Row()
-        for p in range(3 * row_points[row]):
-            gradient = point_gradient_in[w, first + p]
+        for p in range(wp.static(AHEAD) * part, last, wp.static(AHEAD) * parts):
+            gradient = Ahead()
+            for n in range(wp.static(AHEAD)):  # likewise
+                if p + n < last:
+                    gradient[n] = point_gradient_in[w, first + p + n]
+            for n in range(wp.static(AHEAD)):
+                if p + n < last:
+                    s += four(point_basis, at + (p + n) * stride, Row()) * gradient[n]
+        s = whole(s, parts)
+        if part == 0 and world < point_gradient_in.shape[0]:
             for c in range(wp.static(GROUP)):
-                s[c] += gradient * point_basis[at + p * stride + c]
-        for c in range(wp.static(GROUP)):
-            wide_row_out[w, k + c] = s[c]
+                wide_row_out[w, k + c] = s[c]
 
     return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)

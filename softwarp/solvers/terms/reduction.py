@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import mode_loads, mode_places, reduction, samples, tensor_sums
+from softwarp.kernels.elements import mode_places, reduction, samples, tensor_sums
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
+from softwarp.solvers.subspace import each_load
 from softwarp.solvers.terms.floating import FloatingFrames
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
@@ -156,8 +157,7 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.turn_loads()
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
-        items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
-        s.each(self.k.add_forces, items, [*inputs, w.listed_force.S], [w.wide_force.S])
+        each_load(s, self.k.add_forces, m.wide_count, len(m.body), [*inputs, w.listed_force.S], [w.wide_force.S])
         if self.frames is not None:
             self.frames.rigid_loads()
         s.each(self.k.narrow, m.count, [m.mode_wide, w.wide_force.S], [w.mode_force.S])
@@ -174,9 +174,9 @@ class ReductionTerm(Term):
         """Entries of rows at modes."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.row_body, m.row_point, m.row_points, m.row_basis, m.row_wide, m.wide_row, m.body_stride]
-        items = int(m.wide_row.size) // mode_loads.GROUP if s.variant.world_fastest else int(m.row_body.size)
         gradient = w.point_gradient.S if self.frames is None else self.frames.gradients()
-        s.each(self.k.mode_rows, items, [*inputs, m.point_basis, gradient], [w.wide_row.S])
+        modes, rows = int(m.wide_row.size), int(m.row_body.size)
+        each_load(s, self.k.mode_rows, modes, rows, [*inputs, m.point_basis, gradient], [w.wide_row.S])
         if self.frames is not None:
             self.frames.rows()
         inputs = [s.model.dof_count, m.entry, m.entry_wide, s.model.entry_dof, s.model.entry_row, w.wide_row.S]

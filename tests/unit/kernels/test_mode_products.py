@@ -92,7 +92,8 @@ def test_forces_on_modes(worlds):
     inputs += [wp.array(f.reshape(worlds, -1), dtype=wp.float64, device="cpu")]
     out = wp.full((worlds, int(wide[-1])), 2.0, dtype=wp.float64, device="cpu")
     kernel = mode_loads.kernels(variant).add_forces
-    found = launch(kernel, (int(wide[-1]) // mode_loads.GROUP, worlds), inputs, out)
+    parts, threads = mode_loads.team("cpu", worlds, int(wide[-1]))
+    found = launch(kernel, threads, [parts, *inputs], out)
     for number, s in enumerate(STRIDES):
         wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
@@ -113,7 +114,8 @@ def test_rows_on_modes(worlds):
     inputs += [wp.array(gradient, dtype=wp.float64, device="cpu")]
     out = wp.zeros((worlds, int(stride.sum())), dtype=wp.float64, device="cpu")
     kernel = mode_loads.kernels(variant).mode_rows
-    found = launch(kernel, (int(stride.sum()) // mode_loads.GROUP, worlds), inputs, out)
+    parts, threads = mode_loads.team("cpu", worlds, int(stride.sum()))
+    found = launch(kernel, threads, [parts, *inputs], out)
     for row, b in enumerate(basis):
         own = gradient[:, 3 * arrays[1][row] :][:, : 3 * points[row]]
         np.testing.assert_allclose(found[:, wide[row] : wide[row] + stride[row]], own @ b, rtol=1e-12, atol=1e-12)
