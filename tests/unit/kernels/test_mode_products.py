@@ -54,24 +54,46 @@ def test_stiffness_in_modes(size, worlds):
 def test_stiffness_on_tensor_cores(modes, device):
     """E' K E of the second of two bodies with its tets and triangles, as exact as sums of float32; an odd world too."""
     draws, first, count = np.random.default_rng(modes), 5, {samples.TET: 21, samples.TRI: 10}
-    wanted, arrays, stiffness = 0.0, [], []
+    wanted, arrays, stiffness, halves, scales = 0.0, [], [], [], []
     for size, many in count.items():
         E = draws.normal(size=(first + many, size, modes)).astype(np.float32)
         K = draws.normal(size=(WORLDS, first + many, size, size)).astype(np.float32)
         arrays.append(wp.array(E.ravel(), dtype=wp.float32, device=device))
         stiffness.append(wp.array(K.reshape(WORLDS, -1), dtype=wp.float32, device=device))
+        parts = tensor_sums.fragments(E[first:])
+        halves.append(wp.array(parts.halves, dtype=wp.int32, device=device))
+        scales += [parts.most, parts.back]
         own = [a.astype(np.float64) for a in (E[first:], K[:, first:])]
         wanted = wanted + np.einsum("eai,weab,ebj->wij", own[0], own[1], own[0], optimize=True)
     begin = [number for size, many in count.items() for number in (many, first * size * modes, first * size**2)]
     total = wp.full((WORLDS, 7 + modes**2), 7.0, dtype=wp.float32, device=device)
     kernel = tensor_sums.kernels(lanes.variant("cuda", "float32"), modes).stiffness
     dim, block = (-(-WORLDS // tensor_sums.GROUP), tensor_sums.THREADS), tensor_sums.THREADS
-    wp.launch(kernel, dim, [*begin, 7, *arrays, *stiffness], [total], device=device, block_dim=block)
+    wp.launch(kernel, dim, [*begin, 7, *scales, *arrays, *halves, *stiffness], [total], device=device, block_dim=block)
     found = total.numpy()
     low = np.tril_indices(modes)
     error = (found[:, 7:].reshape(wanted.shape) - wanted)[:, *low]
     assert np.sqrt((error**2).mean() / (wanted[:, *low] ** 2).mean()) < 1.0e-6
     assert (found[:, :7] == 7.0).all()
+
+
+@pytest.mark.parametrize("size", [samples.TET, samples.TRI])
+def test_halves_are_the_rows_to_rounding(size):
+    """Heads and tails at the places that tensor cores give them, to 2^-23 of a number or 2^-39 of the largest."""
+    E = np.random.default_rng(size).normal(size=(11, size, 32)).astype(np.float32) * np.float32(28.0)
+    E[3] *= 1e-4
+    parts = tensor_sums.fragments(E)
+    rounds = -(-size // 2)
+    both = parts.halves.view(np.float16).reshape(2, rounds, 2, 2, 32, 4, 2).astype(np.float64)
+    assert np.abs(both).max() <= 2.0**tensor_sums.TOP
+    found, seen = both.sum(axis=3) * parts.back, 0
+    for stage, r, tile, thread, q, row in np.ndindex(found.shape):
+        sample, mode = 8 * stage + thread % 4 + 4 * (q // 2), 16 * tile + thread // 4 + 8 * (q % 2)
+        is_one = sample < len(E) and 2 * r + row < size
+        wanted = E[sample, 2 * r + row, mode] if is_one else 0.0
+        assert abs(found[stage, r, tile, thread, q, row] - wanted) <= max(2.0**-23 * abs(wanted), 2.0**-25 * parts.back)
+        seen += is_one
+    assert seen == E.size and parts.most == np.abs(E).max()
 
 
 @pytest.mark.parametrize("worlds", [3, 64])
