@@ -128,7 +128,9 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
     S = variant.S
     module = variant.module("contact_panel_wide" if wide else "contact_panel")
     group_size, axes = (2 * GROUP, 3) if wide else (GROUP, 1)
-    shares, room = 3 // axes, 9 * MOST_COLUMNS + 8  # tasks of a block of L, entries of a contact, in banks of their own
+    shares = 3 // axes  # tasks of a block of L
+    room = 9 * MOST_COLUMNS + 32 // group_size  # entries of a contact, in banks of their own
+    keeps_given = wide and S is wp.float32  # what a panel's sides were, too, if there is room
     Sums = wp.types.vector(3 * axes, dtype=S)
     block = cholesky_panels.kernels(variant).block
     vec = wp.types.vector(3, dtype=S)
@@ -141,6 +143,9 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
 
     @wp.func_native(shared_memory(S, room * group_size))
     def solved(place: int, value: S, write: bool) -> S: ...
+
+    @wp.func_native(shared_memory(S, room * group_size if keeps_given else 1))
+    def given(place: int, value: S, write: bool) -> S: ...
 
     @wp.func
     def climb(row: int, column_panel: wp.array(dtype=wp.int32), panel: wp.array(dtype=wp.vec4i)):
@@ -336,6 +341,14 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
         return vec(solved(place, zero, False), solved(place + 3, zero, False), solved(place + 6, zero, False))
 
     @wp.func
+    def side(sides: wp.array2d(dtype=S), w: int, at: int, place: int):
+        """The same of what was there before."""
+        if wp.static(keeps_given):
+            zero = S(0.0)
+            return vec(given(place, zero, False), given(place + 3, zero, False), given(place + 6, zero, False))
+        return vec(sides[w, at], sides[w, at + 3], sides[w, at + 6])
+
+    @wp.func
     def team_of(contacts: int, threads: int):
         """Contacts that threads work on side by side: a power of two, so that each thread has one of them."""
         lanes = int(1)
@@ -386,6 +399,14 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                 k = panel[p][1]
                 inverse = column[q][3]
                 below = column_lower[q]
+                if wp.static(keeps_given):
+                    for contact in range(first + thread % lanes, end, lanes):
+                        place = place_in[w, contact * size + column[q][0]]
+                        keep = wp.static(room) * (contact - first)
+                        if place >= 0:
+                            for task in range(worker, 9 * k, workers):
+                                given(keep + task, side_out[w, 9 * (contact * path_limit + place) + task], True)
+                    barrier()
                 for contact in range(first + thread % lanes, end, lanes):
                     base = contact * size
                     place = place_in[w, base + column[q][0]]
@@ -398,8 +419,8 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                             for j in range(t + 1):
                                 turned = wp.transpose(block(lower_in, w, inverse + j * k + t, k * k))
                                 for a in range(wp.static(axes)):
-                                    at = begin + 9 * j + task % wp.static(shares) + a
-                                    z = turned * vec(side_out[w, at], side_out[w, at + 3], side_out[w, at + 6])
+                                    at = 9 * j + task % wp.static(shares) + a
+                                    z = turned * side(side_out, w, begin + at, keep + at)
                                     for r in range(3):
                                         y[3 * a + r] += z[r]
                             for a in range(wp.static(axes)):
