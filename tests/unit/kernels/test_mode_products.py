@@ -96,9 +96,25 @@ def test_halves_are_the_rows_to_rounding(size):
     assert seen == E.size and parts.most == np.abs(E).max()
 
 
-@pytest.mark.parametrize("worlds", [3, 64])
-def test_forces_on_modes(worlds):
-    """Phi' f of both bodies is added, whatever nodes have no force; also where warps of a block share worlds."""
+@pytest.fixture(params=[(3, 1), (16, 1), (3, mode_loads.PARTS)], ids=["alone", "beside", "shared"])
+def team(request, monkeypatch):
+    """Worlds, threads for each of them and some modes, and threads of a block, which run together if they share."""
+    worlds, parts = request.param
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", parts > 1)
+    return worlds, parts, 32 if parts > 1 else 1
+
+
+def load(kernel, team, modes, inputs, output):
+    """Launch a kernel of ``mode_loads`` on a CPU."""
+    worlds, parts, block = team
+    threads = parts * mode_loads.team("cpu", worlds, modes)[1]
+    wp.launch(kernel, threads, [parts, *inputs], [output], device="cpu", block_dim=block)
+    return output.numpy()
+
+
+def test_forces_on_modes(team):
+    """Phi' f of both bodies is added, whatever nodes have no force; also where threads share nodes."""
+    worlds = team[0]
     draws, variant = np.random.default_rng(1), lanes.variant("cuda", "float64")
     nodes, body = 9, np.array([0, 1, 1, 0, 1, 0, 0, 1, 1])
     stride = np.array(STRIDES)[body]
@@ -114,16 +130,15 @@ def test_forces_on_modes(worlds):
     inputs += [wp.array(f.reshape(worlds, -1), dtype=wp.float64, device="cpu")]
     out = wp.full((worlds, int(wide[-1])), 2.0, dtype=wp.float64, device="cpu")
     kernel = mode_loads.kernels(variant).add_forces
-    parts, threads = mode_loads.team("cpu", worlds, int(wide[-1]))
-    found = launch(kernel, threads, [parts, *inputs], out)
+    found = load(kernel, team, int(wide[-1]), inputs, out)
     for number, s in enumerate(STRIDES):
         wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("worlds", [3, 64])
-def test_rows_on_modes(worlds):
+def test_rows_on_modes(team):
     """Rows of H on the modes of their bodies, from gradients by their points."""
+    worlds = team[0]
     draws, variant = np.random.default_rng(3), lanes.variant("cuda", "float64")
     points, body = np.array([4, 7, 5]), np.array([0, 1, 1])
     stride = np.array(STRIDES)[body]
@@ -136,8 +151,7 @@ def test_rows_on_modes(worlds):
     inputs += [wp.array(gradient, dtype=wp.float64, device="cpu")]
     out = wp.zeros((worlds, int(stride.sum())), dtype=wp.float64, device="cpu")
     kernel = mode_loads.kernels(variant).mode_rows
-    parts, threads = mode_loads.team("cpu", worlds, int(stride.sum()))
-    found = launch(kernel, threads, [parts, *inputs], out)
+    found = load(kernel, team, int(stride.sum()), inputs, out)
     for row, b in enumerate(basis):
         own = gradient[:, 3 * arrays[1][row] :][:, : 3 * points[row]]
         np.testing.assert_allclose(found[:, wide[row] : wide[row] + stride[row]], own @ b, rtol=1e-12, atol=1e-12)
