@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from softwarp.kernels.algebra import team
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import floating, mode_loads, mode_places, reduction
 from softwarp.kernels.rows import touch
@@ -106,5 +107,5 @@ def each_load(shard: Shard, kernel: Any, modes: int, items: int, inputs: list[An
     if not shard.variant.world_fastest:
         shard.each(kernel, items, inputs, outputs)
     elif modes:
-        parts, threads = mode_loads.team(shard.device, shard.width, modes)
+        parts, threads = team.team(shard.device, shard.width, modes // mode_loads.GROUP)
         wp.launch(kernel, threads, [parts, *inputs], outputs, device=shard.device)

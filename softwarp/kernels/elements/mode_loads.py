@@ -5,18 +5,16 @@ Theory: docs/theory/reduction.md.
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
+from softwarp.kernels.algebra import team
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import mode_sums
-from softwarp.kernels.linear.cholesky_panels import exchange_code, name_of
+from softwarp.kernels.linear.cholesky_panels import name_of
 
 GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
 AHEAD = 4  # nodes whose forces it reads at once
-BESIDE = 8  # worlds of a warp, which so reads whole sectors of 32 bytes
-PARTS = 4  # threads that share the nodes of one world and some modes
 
 # Four entries of a row, to which a GPU's threads go with one access.
 _FOUR = """
@@ -29,12 +27,6 @@ for (int c = 0; c < 4; ++c) row.c[c] = basis.data[at + c];
 #endif
 return row;
 """
-
-
-def team(device: Any, worlds: int, modes: int) -> tuple[int, int]:
-    """Threads that share the nodes of one world and some modes on a device, and those of a GPU's launch in all."""
-    parts = PARTS if wp.get_device(device).is_cuda else 1
-    return parts, modes // GROUP * -(-worlds // BESIDE) * BESIDE * parts
 
 
 @cache
@@ -161,31 +153,10 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
     Forces = wp.types.vector(3 * AHEAD, S)
     Places = wp.types.vector(AHEAD, wp.int32)
     Ahead = wp.types.vector(AHEAD, S)
+    seat, whole = vars(team.functions(variant)).values()
 
     @wp.func_native(_FOUR.replace("SCALAR", name_of(S)))
     def four(basis: wp.array(dtype=S), at: int, row: Row) -> Row: ...
-
-    @wp.func_native(exchange_code(S))
-    def exchange(value: S, offset: int) -> S: ...
-
-    @wp.func
-    def seat(place: int, items: int, parts: int):
-        """Item, world and part of a thread: ``BESIDE`` worlds have all their items before the next."""
-        beside = place % wp.static(BESIDE)
-        rest = place // (wp.static(BESIDE) * parts)
-        world = rest // items * wp.static(BESIDE) + beside
-        return rest % items, world, place // wp.static(BESIDE) % parts
-
-    @wp.func
-    def whole(row: Row, parts: int):
-        """Sum of what the threads of a world and some modes have."""
-        total = row
-        offset = wp.static(BESIDE) * parts // 2
-        while offset >= wp.static(BESIDE):
-            for c in range(wp.static(GROUP)):
-                total[c] += exchange(total[c], offset)
-            offset = offset // 2
-        return total
 
     @wp.kernel(module=module, enable_backward=False)
     def add_forces(
@@ -232,7 +203,8 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
                     s += four(basis, row, Row()) * fx
                     s += four(basis, row + stride, Row()) * fy
                     s += four(basis, row + 2 * stride, Row()) * fz
-        s = whole(s, parts)
+        for c in range(wp.static(GROUP)):
+            s[c] = whole(s[c], parts)
         if part == 0 and world < balance_in.shape[0]:
             for c in range(wp.static(GROUP)):
                 wide_force_out[w, k + c] += s[c]
@@ -273,7 +245,8 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
             for n in range(wp.static(AHEAD)):
                 if p + n < last:
                     s += four(point_basis, at + (p + n) * stride, Row()) * gradient[n]
-        s = whole(s, parts)
+        for c in range(wp.static(GROUP)):
+            s[c] = whole(s[c], parts)
         if part == 0 and world < point_gradient_in.shape[0]:
             for c in range(wp.static(GROUP)):
                 wide_row_out[w, k + c] = s[c]

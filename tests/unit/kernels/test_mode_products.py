@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
+from softwarp.kernels.algebra import team as sums_of_teams
 from softwarp.kernels.elements import mode_loads, mode_places, reduction, samples, tensor_sums
 
 WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
@@ -96,7 +97,7 @@ def test_halves_are_the_rows_to_rounding(size):
     assert seen == E.size and parts.most == np.abs(E).max()
 
 
-@pytest.fixture(params=[(3, 1), (16, 1), (3, mode_loads.PARTS)], ids=["alone", "beside", "shared"])
+@pytest.fixture(params=[(3, 1), (16, 1), (3, sums_of_teams.PARTS)], ids=["alone", "beside", "shared"])
 def team(request, monkeypatch):
     """Worlds, threads for each of them and some modes, and threads of a block, which run together if they share."""
     worlds, parts = request.param
@@ -107,7 +108,7 @@ def team(request, monkeypatch):
 def load(kernel, team, modes, inputs, output):
     """Launch a kernel of ``mode_loads`` on a CPU."""
     worlds, parts, block = team
-    threads = parts * mode_loads.team("cpu", worlds, modes)[1]
+    threads = parts * sums_of_teams.team("cpu", worlds, modes // mode_loads.GROUP)[1]
     wp.launch(kernel, threads, [parts, *inputs], [output], device="cpu", block_dim=block)
     return output.numpy()
 
