@@ -99,7 +99,9 @@ class Subspace:
                 s.each_world(self.k_loads.touch_loads, inputs, [self.wide.S, target.S])
                 return
             inputs = [self.model.dof_count, r.mode_dof, r.block_touch, r.touch_begin, r.touch_stride, r.touch_basis]
-            s.each(self.k.touch_forces, r.count // 3, [*inputs, r.basis, forces.S], [target.S])
+            parts, threads = team.team(s.device, s.width, r.count // 3)
+            inputs = [parts, *inputs, r.basis, forces.S]
+            wp.launch(self.k_loads.touch_forces, threads, inputs, [target.S], device=s.device)
 
 
 def each_load(shard: Shard, kernel: Any, modes: int, items: int, inputs: list[Any], outputs: list[Any]) -> None:

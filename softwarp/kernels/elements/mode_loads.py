@@ -31,7 +31,7 @@ return row;
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
-    """``add_forces`` and ``mode_rows`` for one scalar type, and on a CPU ``touch_loads``."""
+    """``add_forces``, ``mode_rows`` and ``touch_loads`` for one scalar type, or ``touch_forces`` on a GPU."""
     return _by_modes(variant) if variant.world_fastest else _by_bodies(variant)
 
 
@@ -153,6 +153,7 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
     Forces = wp.types.vector(3 * AHEAD, S)
     Places = wp.types.vector(AHEAD, wp.int32)
     Ahead = wp.types.vector(AHEAD, S)
+    Three = wp.types.vector(3, S)
     seat, whole = vars(team.functions(variant)).values()
 
     @wp.func_native(_FOUR.replace("SCALAR", name_of(S)))
@@ -251,4 +252,48 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
             for c in range(wp.static(GROUP)):
                 wide_row_out[w, k + c] = s[c]
 
-    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
+    @wp.kernel(module=module, enable_backward=False)
+    def touch_forces(
+        parts: int,
+        dof_count: int,
+        # Model
+        mode_dof: wp.array(dtype=wp.int32),
+        block_touch: wp.array2d(dtype=wp.int32),
+        touch_begin: wp.array(dtype=wp.int32),
+        touch_stride: wp.array(dtype=wp.int32),
+        touch_basis: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        # Workspace in
+        dof_in: wp.array2d(dtype=S),
+        # Workspace out
+        target_out: wp.array2d(dtype=S),
+    ):
+        """Add to forces on one dof of three modes Phi' f of the nodes that touch something; most have none."""
+        block, world, part = seat(wp.tid(), mode_dof.shape[0], parts)
+        w = wp.min(world, dof_in.shape[0] - 1)
+        last = block_touch[block, 1]
+        s = Three()
+        for p in range(block_touch[block, 0] + wp.static(AHEAD) * part, last, wp.static(AHEAD) * parts):
+            f = Forces()
+            for n in range(wp.static(AHEAD)):  # unrolled, likewise
+                if p + n < last:
+                    for c in range(3):
+                        f[3 * n + c] = dof_in[w, 3 * (dof_count + p + n) + c]
+            for n in range(wp.static(AHEAD)):
+                fx = f[3 * n]
+                fy = f[3 * n + 1]
+                fz = f[3 * n + 2]
+                if fx * fx + fy * fy + fz * fz > S(0.0):
+                    stride = touch_stride[p + n]
+                    x = touch_basis[p + n] + 3 * (block - touch_begin[p + n])
+                    y = x + stride
+                    z = y + stride
+                    for c in range(3):
+                        s[c] += fx * basis[x + c] + fy * basis[y + c] + fz * basis[z + c]
+        target = 3 * mode_dof[block]
+        for c in range(3):
+            total = whole(s[c], parts)
+            if part == 0 and world < dof_in.shape[0]:
+                target_out[w, target + c] += total
+
+    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows, touch_forces=touch_forces)

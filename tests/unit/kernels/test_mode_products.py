@@ -137,6 +137,32 @@ def test_forces_on_modes(team):
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
 
 
+def test_forces_of_contacts_on_modes(team):
+    """Phi' f of the nodes that touch something is added to forces on the dofs of their bodies' modes."""
+    worlds, parts, block = team
+    draws, variant, dofs = np.random.default_rng(6), lanes.variant("cuda", "float64"), 20
+    nodes, blocks = (7, 21), tuple(s // 3 for s in STRIDES)
+    stride, begin = np.repeat(STRIDES, nodes), np.repeat([0, blocks[0]], nodes)
+    basis = [draws.normal(size=(3, s)) for s in stride]
+    f = draws.normal(size=(worlds, sum(nodes), 3)) * (draws.uniform(size=(worlds, sum(nodes), 1)) < 0.5)
+    mode_dof = 1 + draws.permutation(sum(blocks))
+    ranges = np.repeat([[0, nodes[0]], [nodes[0], sum(nodes)]], blocks, axis=0)
+    arrays = [mode_dof, ranges, begin, stride, np.cumsum(3 * stride) - 3 * stride]
+    inputs = [wp.array(a, dtype=wp.int32, device="cpu") for a in arrays]
+    inputs.append(wp.array(np.concatenate([b.ravel() for b in basis]), dtype=wp.float64, device="cpu"))
+    forces = np.concatenate([np.full((worlds, 3 * dofs), np.nan), f.reshape(worlds, -1)], axis=1)
+    inputs.append(wp.array(forces, dtype=wp.float64, device="cpu"))
+    out = wp.full((worlds, 3 * dofs), 2.0, dtype=wp.float64, device="cpu")
+    threads = parts * sums_of_teams.team("cpu", worlds, sum(blocks))[1]
+    kernel = mode_loads.kernels(variant).touch_forces
+    wp.launch(kernel, threads, [parts, dofs, *inputs], [out], device="cpu", block_dim=block)
+    wanted = np.full((worlds, dofs, 3), 2.0)
+    for k, dof in enumerate(mode_dof):
+        at = 3 * (k - (k >= blocks[0]) * blocks[0])
+        wanted[:, dof] += sum(f[:, n] @ basis[n][:, at : at + 3] for n in range(*ranges[k]))
+    np.testing.assert_allclose(out.numpy(), wanted.reshape(worlds, -1), rtol=1e-12)
+
+
 def test_rows_on_modes(team):
     """Rows of H on the modes of their bodies, from gradients by their points."""
     worlds = team[0]
