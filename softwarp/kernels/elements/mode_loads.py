@@ -177,10 +177,10 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         wide_force_out: wp.array2d(dtype=S),
     ):
         """Add Phi' f over the nodes of their body to a group of wide modes; most nodes have no force at all."""
-        place = wp.tid()
-        group, world, part = seat(place, wide_body.shape[0] // wp.static(GROUP), parts)
+        group = wp.tid()
+        item, world, part = seat(group, wide_body.shape[0] // wp.static(GROUP), parts)
         w = wp.min(world, balance_in.shape[0] - 1)  # all threads of a warp take part in its exchanges
-        k = wp.static(GROUP) * group
+        k = wp.static(GROUP) * item
         body = wide_body[k]
         stride = body_stride[body]
         last = body_node[body + 1]
@@ -228,10 +228,10 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         wide_row_out: wp.array2d(dtype=S),
     ):
         """A group of wide modes of a row of H, from the gradient by its points."""
-        place = wp.tid()
-        group, world, part = seat(place, wide_row.shape[0] // wp.static(GROUP), parts)
+        group = wp.tid()
+        item, world, part = seat(group, wide_row.shape[0] // wp.static(GROUP), parts)
         w = wp.min(world, point_gradient_in.shape[0] - 1)
-        k = wp.static(GROUP) * group
+        k = wp.static(GROUP) * item
         row = wide_row[k]
         stride = body_stride[row_body[row]]
         at = row_basis[row] + k - row_wide[row]
@@ -269,7 +269,8 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         target_out: wp.array2d(dtype=S),
     ):
         """Add to forces on one dof of three modes Phi' f of the nodes that touch something; most have none."""
-        block, world, part = seat(wp.tid(), mode_dof.shape[0], parts)
+        group = wp.tid()
+        block, world, part = seat(group, mode_dof.shape[0], parts)
         w = wp.min(world, dof_in.shape[0] - 1)
         last = block_touch[block, 1]
         s = Three()

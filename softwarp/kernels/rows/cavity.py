@@ -446,7 +446,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             volume_out: wp.array2d(dtype=S),
         ):
             """``cavity_volume`` where some threads of a GPU share the points of a chamber."""
-            cavity, world, part = seat(wp.tid(), cavity_point_start.shape[0] - 1, parts)
+            group = wp.tid()
+            cavity, world, part = seat(group, cavity_point_start.shape[0] - 1, parts)
             w = wp.min(world, point_x_in.shape[0] - 1)  # all threads of a warp take part in its exchanges
             first = cavity_point_start[cavity]
             last = cavity_point_start[cavity + 1]

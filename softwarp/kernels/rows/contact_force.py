@@ -107,7 +107,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             add_slot(dof_free, weight, lever, axes, multiplier, f_scale, pack, lane, contact, slot, dof, target_out)
 
     @wp.func
-    def gather(
+    def add_own_slots(
         dof_free: wp.array2d(dtype=real),
         count: int,
         dofs: wp.array3d(dtype=wp.int32),
@@ -182,7 +182,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """
         pack, dof, lane = wp.tid()
         if idle_in[pack, 0, lane] == 0:
-            gather(
+            add_own_slots(
                 dof_free,
                 count_in[pack, 0, lane],
                 dof_in,
@@ -218,7 +218,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """The same where a world's threads are neighbours: a thread has some of many dofs, which few contacts touch."""
         pack, lane, thread = wp.tid()
         if idle_in[pack, 0, lane] == 0:
-            gather(
+            add_own_slots(
                 dof_free,
                 count_in[pack, 0, lane],
                 dof_in,
