@@ -10,10 +10,28 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear.cholesky_panels import exchange_code
 
 BESIDE = 8  # worlds of a warp
 PARTS = 4  # threads that share a sum
+
+_EXCHANGE = """
+#if defined(__CUDA_ARCH__)
+return __shfl_xor_sync(0xffffffffu, value, offset);
+#else
+if (WP_TILE_BLOCK_DIM == 1) return value;
+static SCALAR slots[1024];
+slots[WP_TILE_THREAD_IDX] = value;
+WP_TILE_SYNC();
+const SCALAR result = slots[WP_TILE_THREAD_IDX ^ offset];
+WP_TILE_SYNC();
+return result;
+#endif
+"""
+
+
+def exchange_code(real: Any) -> str:
+    """Native code of the value of the thread whose number differs in the bits of ``offset``."""
+    return _EXCHANGE.replace("SCALAR", "double" if real is wp.float64 else "float")
 
 
 def team(device: Any, worlds: int, sums: int) -> tuple[int, int]:

@@ -11,7 +11,6 @@ import warp as wp
 from softwarp.kernels.algebra import team
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import mode_sums
-from softwarp.kernels.linear.cholesky_panels import name_of
 
 GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
 AHEAD = 4  # nodes whose forces it reads at once
@@ -156,7 +155,7 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
     Three = wp.types.vector(3, S)
     seat, whole = vars(team.functions(variant)).values()
 
-    @wp.func_native(_FOUR.replace("SCALAR", name_of(S)))
+    @wp.func_native(_FOUR.replace("SCALAR", "double" if S is wp.float64 else "float"))
     def four(basis: wp.array(dtype=S), at: int, row: Row) -> Row: ...
 
     @wp.kernel(module=module, enable_backward=False)
