@@ -39,8 +39,7 @@ return value;
 """
 
 # Blocks of W of contacts first .. end - 1 with all up to them. Sums run over the dofs in order of their columns, as
-# paths do; a dof that is not on a path adds zeros. A lane of a warp has every 32nd of the other contacts, of which it
-# reads a dof's entries once for all contacts of its warp.
+# paths do; a dof that is not on a path adds zeros. A lane of a warp has every 32nd of the other contacts.
 _PRODUCTS = """
 #if defined(__CUDA_ARCH__)
 __shared__ SCALAR near[NEAR * (9 * DOFS + 1)];
@@ -58,7 +57,6 @@ const int own = first + thread / 32, lane = thread % 32;
 SCALAR sum[EACH][OTHERS][9] = {};
 for (int q = 0; q < size; q += DOFS) {
     const int dofs = size - q < DOFS ? size - q : DOFS;
-    #pragma unroll 4
     for (int e = thread; e < end * 9 * DOFS; e += THREADS) {
         const int c = e / (9 * DOFS), at = e % (9 * DOFS), d = at / 9;
         SCALAR value = 0;
@@ -69,31 +67,25 @@ for (int q = 0; q < size; q += DOFS) {
         near[c * STRIDE + at] = value;
     }
     MEET
-    for (int d = 0; d < dofs; ++d) {
-        SCALAR a[EACH][9];
+    for (int d = 0; d < dofs; ++d)
         #pragma unroll
         for (int i = 0; i < EACH; ++i) {
-            const int c = own + i * (THREADS / 32) < end ? own + i * (THREADS / 32) : first;
+            const int c = own + i * (THREADS / 32);
+            if (c >= end) continue;
+            SCALAR a[9];
             #pragma unroll
-            for (int k = 0; k < 9; ++k) a[i][k] = near[c * STRIDE + 9 * d + k];
-        }
-        #pragma unroll
-        for (int m = 0; m < OTHERS; ++m) {
-            if (32 * m >= end) continue;
-            const SCALAR* const from = near + (lane + 32 * m < end ? lane + 32 * m : first) * STRIDE + 9 * d;
-            SCALAR b[9];
+            for (int k = 0; k < 9; ++k) a[k] = near[c * STRIDE + 9 * d + k];
             #pragma unroll
-            for (int k = 0; k < 9; ++k) b[k] = from[k];
-            #pragma unroll
-            for (int i = 0; i < EACH; ++i) {
-                if (32 * m > own + i * (THREADS / 32)) continue;
+            for (int m = 0; m < OTHERS; ++m) {
+                const int other = lane + 32 * m;
+                if (other > c) continue;
+                const SCALAR* const b = near + other * STRIDE + 9 * d;
                 #pragma unroll
                 for (int r = 0; r < 9; r += 3)
                     #pragma unroll
-                    for (int k = 0; k < 9; ++k) sum[i][m][k] += a[i][r + k / 3] * b[r + k % 3];
+                    for (int k = 0; k < 9; ++k) sum[i][m][k] += a[r + k / 3] * b[r + k % 3];
             }
         }
-    }
     MEET
 }
 #pragma unroll
@@ -128,9 +120,7 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
     S = variant.S
     module = variant.module("contact_panel_wide" if wide else "contact_panel")
     group_size, axes = (2 * GROUP, 3) if wide else (GROUP, 1)
-    shares = 3 // axes  # tasks of a block of L
-    room = 9 * MOST_COLUMNS + 32 // group_size  # entries of a contact, in banks of their own
-    keeps_given = wide and S is wp.float32  # what a panel's sides were, too, if there is room
+    shares, room = 3 // axes, 9 * MOST_COLUMNS + 8  # tasks of a block of L, entries of a contact, in banks of their own
     Sums = wp.types.vector(3 * axes, dtype=S)
     block = cholesky_panels.kernels(variant).block
     vec = wp.types.vector(3, dtype=S)
@@ -143,9 +133,6 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
 
     @wp.func_native(shared_memory(S, room * group_size))
     def solved(place: int, value: S, write: bool) -> S: ...
-
-    @wp.func_native(shared_memory(S, room * group_size if keeps_given else 1))
-    def given(place: int, value: S, write: bool) -> S: ...
 
     @wp.func
     def climb(row: int, column_panel: wp.array(dtype=wp.int32), panel: wp.array(dtype=wp.vec4i)):
@@ -341,14 +328,6 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
         return vec(solved(place, zero, False), solved(place + 3, zero, False), solved(place + 6, zero, False))
 
     @wp.func
-    def side(sides: wp.array2d(dtype=S), w: int, at: int, place: int):
-        """The same of what was there before."""
-        if wp.static(keeps_given):
-            zero = S(0.0)
-            return vec(given(place, zero, False), given(place + 3, zero, False), given(place + 6, zero, False))
-        return vec(sides[w, at], sides[w, at + 3], sides[w, at + 6])
-
-    @wp.func
     def team_of(contacts: int, threads: int):
         """Contacts that threads work on side by side: a power of two, so that each thread has one of them."""
         lanes = int(1)
@@ -399,14 +378,6 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                 k = panel[p][1]
                 inverse = column[q][3]
                 below = column_lower[q]
-                if wp.static(keeps_given):
-                    for contact in range(first + thread % lanes, end, lanes):
-                        place = place_in[w, contact * size + column[q][0]]
-                        keep = wp.static(room) * (contact - first)
-                        if place >= 0:
-                            for task in range(worker, 9 * k, workers):
-                                given(keep + task, side_out[w, 9 * (contact * path_limit + place) + task], True)
-                    barrier()
                 for contact in range(first + thread % lanes, end, lanes):
                     base = contact * size
                     place = place_in[w, base + column[q][0]]
@@ -419,8 +390,8 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                             for j in range(t + 1):
                                 turned = wp.transpose(block(lower_in, w, inverse + j * k + t, k * k))
                                 for a in range(wp.static(axes)):
-                                    at = 9 * j + task % wp.static(shares) + a
-                                    z = turned * side(side_out, w, begin + at, keep + at)
+                                    at = begin + 9 * j + task % wp.static(shares) + a
+                                    z = turned * vec(side_out[w, at], side_out[w, at + 3], side_out[w, at + 6])
                                     for r in range(3):
                                         y[3 * a + r] += z[r]
                             for a in range(wp.static(axes)):
