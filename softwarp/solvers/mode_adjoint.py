@@ -12,6 +12,7 @@ from softwarp.model.gradients import Gradients
 from softwarp.model.reduction import ReductionModel
 from softwarp.solvers.floating_adjoint import FloatingAdjoint
 from softwarp.solvers.leaning_adjoint import Leaning
+from softwarp.solvers.subspace import each_load
 from softwarp.solvers.terms.reduction import ReductionTerm
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
@@ -85,8 +86,7 @@ class ModeAdjoint:
         s, m = self.shard, self.model
         self.wide.zero()
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
-        items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
-        s.each(self.k_loads.add_forces, items, [*inputs, listed.S], [self.wide.S])
+        each_load(s, self.k_loads.add_forces, m.wide_count, len(m.body), [*inputs, listed.S], [self.wide.S])
 
     def seed(self, seed: Rows, y: Rows, *, arrives: bool) -> None:
         """Right-hand sides of p, from gradients by the end of a step; those by nodes are taken over first.

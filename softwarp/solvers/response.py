@@ -323,7 +323,12 @@ class ContactResponse:
         inputs = [self.dof_free, c.count.real, *self._rows(), c.multiplier.real, f_scale]
         if self.variant.world_fastest and are_few:
             inputs.insert(2, c.idle.real)
-            self._each_real(self.k_force.gather_force, dofs, inputs, [target.real])
+            if dofs > FEW_DOFS:
+                threads = contact_force.SHARING
+                dim, given = (self.packs, self.lanes, threads), [threads, *inputs]
+                wp.launch(self.k_force.share_force, dim, given, [target.real], device=self.device)
+            else:
+                self._each_real(self.k_force.gather_force, dofs, inputs, [target.real])
         elif self.variant.lanes > 1:
             self._each_world(contact_lanes.kernels().add_force, inputs, [target.real])
         else:

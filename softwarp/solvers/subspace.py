@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from softwarp.kernels.algebra import team
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import floating, mode_loads, mode_places, reduction
 from softwarp.kernels.rows import touch
@@ -98,4 +99,15 @@ class Subspace:
                 s.each_world(self.k_loads.touch_loads, inputs, [self.wide.S, target.S])
                 return
             inputs = [self.model.dof_count, r.mode_dof, r.block_touch, r.touch_begin, r.touch_stride, r.touch_basis]
-            s.each(self.k.touch_forces, r.count // 3, [*inputs, r.basis, forces.S], [target.S])
+            parts, threads = team.team(s.device, s.width, r.count // 3)
+            inputs = [parts, *inputs, r.basis, forces.S]
+            wp.launch(self.k_loads.touch_forces, threads, inputs, [target.S], device=s.device)
+
+
+def each_load(shard: Shard, kernel: Any, modes: int, items: int, inputs: list[Any], outputs: list[Any]) -> None:
+    """Launch a kernel of ``mode_loads`` for some modes on a GPU, for some bodies or rows on a CPU."""
+    if not shard.variant.world_fastest:
+        shard.each(kernel, items, inputs, outputs)
+    elif modes:
+        parts, threads = team.team(shard.device, shard.width, modes // mode_loads.GROUP)
+        wp.launch(kernel, threads, [parts, *inputs], outputs, device=shard.device)

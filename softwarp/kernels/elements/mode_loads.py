@@ -8,16 +8,29 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import team
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import mode_sums
 
 GROUP = 4  # modes that a thread of a GPU adds forces to; strides are multiples of it
 AHEAD = 4  # nodes whose forces it reads at once
 
+# Four entries of a row, to which a GPU's threads go with one access.
+_FOUR = """
+#if defined(__CUDA_ARCH__)
+struct alignas(16) Four { SCALAR x[4]; };
+const Four four = *(const Four*)(basis.data + at);
+for (int c = 0; c < 4; ++c) row.c[c] = four.x[c];
+#else
+for (int c = 0; c < 4; ++c) row.c[c] = basis.data[at + c];
+#endif
+return row;
+"""
+
 
 @cache
 def kernels(variant: Variant) -> SimpleNamespace:
-    """``add_forces`` and ``mode_rows`` for one scalar type, and on a CPU ``touch_loads``."""
+    """``add_forces``, ``mode_rows`` and ``touch_loads`` for one scalar type, or ``touch_forces`` on a GPU."""
     return _by_modes(variant) if variant.world_fastest else _by_bodies(variant)
 
 
@@ -129,26 +142,25 @@ def _by_bodies(host: Variant) -> SimpleNamespace:
 
 @cache
 def _by_modes(variant: Variant) -> SimpleNamespace:
-    """The same on a GPU: one thread for some modes, whose sums run over nodes in order.
+    """The same on a GPU: threads share the nodes for some modes of a world; their sums are added in a fixed order.
 
-    The warps of a block have the same 32 worlds, so that what one reads of a node is near for the others.
+    The warps of a block have the same worlds, so that what one reads of a node is near for the others.
     """
     S = variant.S
     module = variant.module("mode_loads")
     Row = wp.types.vector(GROUP, S)
     Forces = wp.types.vector(3 * AHEAD, S)
     Places = wp.types.vector(AHEAD, wp.int32)
+    Ahead = wp.types.vector(AHEAD, S)
+    Three = wp.types.vector(3, S)
+    seat, whole = vars(team.functions(variant)).values()
 
-    @wp.func
-    def shared(item: int, w: int, items: int, worlds: int):
-        """Item and world of a thread, such that 32 worlds have all their items before the next 32."""
-        if worlds % 32 != 0:
-            return item, w
-        place = item * worlds + w
-        return place // 32 % items, place // 32 // items * 32 + place % 32
+    @wp.func_native(_FOUR.replace("SCALAR", "double" if S is wp.float64 else "float"))
+    def four(basis: wp.array(dtype=S), at: int, row: Row) -> Row: ...
 
     @wp.kernel(module=module, enable_backward=False)
     def add_forces(
+        parts: int,
         # Model
         body_node: wp.array(dtype=wp.int32),
         order: wp.array(dtype=wp.int32),
@@ -164,15 +176,15 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         wide_force_out: wp.array2d(dtype=S),
     ):
         """Add Phi' f over the nodes of their body to a group of wide modes; most nodes have no force at all."""
-        item, world = wp.tid()
-        items = wide_body.shape[0] // wp.static(GROUP)
-        group, w = shared(item, world, items, balance_in.shape[0])
-        k = wp.static(GROUP) * group
+        group = wp.tid()
+        item, world, part = seat(group, wide_body.shape[0] // wp.static(GROUP), parts)
+        w = wp.min(world, balance_in.shape[0] - 1)  # all threads of a warp take part in its exchanges
+        k = wp.static(GROUP) * item
         body = wide_body[k]
         stride = body_stride[body]
         last = body_node[body + 1]
         s = Row()
-        for p in range(body_node[body], last, wp.static(AHEAD)):
+        for p in range(body_node[body] + wp.static(AHEAD) * part, last, wp.static(AHEAD) * parts):
             f = Forces()
             at = Places()
             for n in range(wp.static(AHEAD)):  # unrolled: these loads do not wait for each other
@@ -188,13 +200,18 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
                 fz = f[3 * n + 2]
                 if fx * fx + fy * fy + fz * fz > S(0.0):
                     row = at[n] + k - body_wide[body]
-                    for c in range(wp.static(GROUP)):
-                        s[c] += fx * basis[row + c] + fy * basis[row + c + stride] + fz * basis[row + c + 2 * stride]
+                    s += four(basis, row, Row()) * fx
+                    s += four(basis, row + stride, Row()) * fy
+                    s += four(basis, row + 2 * stride, Row()) * fz
         for c in range(wp.static(GROUP)):
-            wide_force_out[w, k + c] += s[c]
+            s[c] = whole(s[c], parts)
+        if part == 0 and world < balance_in.shape[0]:
+            for c in range(wp.static(GROUP)):
+                wide_force_out[w, k + c] += s[c]
 
     @wp.kernel(module=module, enable_backward=False)
     def mode_rows(
+        parts: int,
         # Model
         row_body: wp.array(dtype=wp.int32),
         row_point: wp.array(dtype=wp.int32),
@@ -210,20 +227,73 @@ def _by_modes(variant: Variant) -> SimpleNamespace:
         wide_row_out: wp.array2d(dtype=S),
     ):
         """A group of wide modes of a row of H, from the gradient by its points."""
-        item, world = wp.tid()
-        items = wide_row.shape[0] // wp.static(GROUP)
-        group, w = shared(item, world, items, point_gradient_in.shape[0])
-        k = wp.static(GROUP) * group
+        group = wp.tid()
+        item, world, part = seat(group, wide_row.shape[0] // wp.static(GROUP), parts)
+        w = wp.min(world, point_gradient_in.shape[0] - 1)
+        k = wp.static(GROUP) * item
         row = wide_row[k]
         stride = body_stride[row_body[row]]
         at = row_basis[row] + k - row_wide[row]
         first = 3 * row_point[row]
+        last = 3 * row_points[row]
         s = Row()
-        for p in range(3 * row_points[row]):
-            gradient = point_gradient_in[w, first + p]
-            for c in range(wp.static(GROUP)):
-                s[c] += gradient * point_basis[at + p * stride + c]
+        for p in range(wp.static(AHEAD) * part, last, wp.static(AHEAD) * parts):
+            gradient = Ahead()
+            for n in range(wp.static(AHEAD)):  # likewise
+                if p + n < last:
+                    gradient[n] = point_gradient_in[w, first + p + n]
+            for n in range(wp.static(AHEAD)):
+                if p + n < last:
+                    s += four(point_basis, at + (p + n) * stride, Row()) * gradient[n]
         for c in range(wp.static(GROUP)):
-            wide_row_out[w, k + c] = s[c]
+            s[c] = whole(s[c], parts)
+        if part == 0 and world < point_gradient_in.shape[0]:
+            for c in range(wp.static(GROUP)):
+                wide_row_out[w, k + c] = s[c]
 
-    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows)
+    @wp.kernel(module=module, enable_backward=False)
+    def touch_forces(
+        parts: int,
+        dof_count: int,
+        # Model
+        mode_dof: wp.array(dtype=wp.int32),
+        block_touch: wp.array2d(dtype=wp.int32),
+        touch_begin: wp.array(dtype=wp.int32),
+        touch_stride: wp.array(dtype=wp.int32),
+        touch_basis: wp.array(dtype=wp.int32),
+        basis: wp.array(dtype=S),
+        # Workspace in
+        dof_in: wp.array2d(dtype=S),
+        # Workspace out
+        target_out: wp.array2d(dtype=S),
+    ):
+        """Add to forces on one dof of three modes Phi' f of the nodes that touch something; most have none."""
+        group = wp.tid()
+        block, world, part = seat(group, mode_dof.shape[0], parts)
+        w = wp.min(world, dof_in.shape[0] - 1)
+        last = block_touch[block, 1]
+        s = Three()
+        for p in range(block_touch[block, 0] + wp.static(AHEAD) * part, last, wp.static(AHEAD) * parts):
+            f = Forces()
+            for n in range(wp.static(AHEAD)):  # unrolled, likewise
+                if p + n < last:
+                    for c in range(3):
+                        f[3 * n + c] = dof_in[w, 3 * (dof_count + p + n) + c]
+            for n in range(wp.static(AHEAD)):
+                fx = f[3 * n]
+                fy = f[3 * n + 1]
+                fz = f[3 * n + 2]
+                if fx * fx + fy * fy + fz * fz > S(0.0):
+                    stride = touch_stride[p + n]
+                    x = touch_basis[p + n] + 3 * (block - touch_begin[p + n])
+                    y = x + stride
+                    z = y + stride
+                    for c in range(3):
+                        s[c] += fx * basis[x + c] + fy * basis[y + c] + fz * basis[z + c]
+        target = 3 * mode_dof[block]
+        for c in range(3):
+            total = whole(s[c], parts)
+            if part == 0 and world < dof_in.shape[0]:
+                target_out[w, target + c] += total
+
+    return SimpleNamespace(add_forces=add_forces, mode_rows=mode_rows, touch_forces=touch_forces)

@@ -20,7 +20,7 @@ from softwarp.kernels.elements import assembly, mode_loads, mode_sums
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type."""
     S, real, mul = variant.S, variant.real, variant.mul
-    any_positive, sqrt = variant.any_positive, variant.sqrt
+    sqrt = variant.sqrt
     world_fastest = variant.world_fastest
     module = variant.module("reduction")
     of_packs = packs.functions(real)
@@ -262,46 +262,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if wp.static(world_fastest):
             i, w = wp.tid()
         target_out[w, i] += force_in[w, i]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def touch_forces(
-        dof_count: int,
-        # Model
-        mode_dof: wp.array(dtype=wp.int32),
-        block_touch: wp.array2d(dtype=wp.int32),
-        touch_begin: wp.array(dtype=wp.int32),
-        touch_stride: wp.array(dtype=wp.int32),
-        touch_basis: wp.array(dtype=wp.int32),
-        basis: wp.array(dtype=real),
-        # Workspace in
-        dof_in: wp.array2d(dtype=S),
-        # Workspace out
-        target_out: wp.array2d(dtype=S),
-    ):
-        """Add forces on one dof of three modes, and Phi' f of the nodes that touch something."""
-        w, block = wp.tid()
-        if wp.static(world_fastest):
-            block, w = wp.tid()
-        target = 3 * mode_dof[block]
-        s0 = S(real(0.0))
-        s1 = S(real(0.0))
-        s2 = S(real(0.0))
-        for i in range(block_touch[block, 0], block_touch[block, 1]):
-            row = 3 * (dof_count + i)
-            fx = dof_in[w, row]
-            fy = dof_in[w, row + 1]
-            fz = dof_in[w, row + 2]
-            if any_positive(mul(fx, fx) + mul(fy, fy) + mul(fz, fz)):
-                stride = touch_stride[i]
-                x = touch_basis[i] + 3 * (block - touch_begin[i])
-                y = x + stride
-                z = y + stride
-                s0 += fx * basis[x] + fy * basis[y] + fz * basis[z]
-                s1 += fx * basis[x + 1] + fy * basis[y + 1] + fz * basis[z + 1]
-                s2 += fx * basis[x + 2] + fy * basis[y + 2] + fz * basis[z + 2]
-        target_out[w, target] += s0
-        target_out[w, target + 1] += s1
-        target_out[w, target + 2] += s2
 
     @wp.kernel(module=module, enable_backward=False)
     def mode_weight(
@@ -569,7 +529,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         node_balance=node_balance,
         touch_velocities=touch_velocities,
         add_dof_forces=add_dof_forces,
-        touch_forces=touch_forces,
         mode_weight=mode_weight,
         mode_tangent=mode_tangent,
         right_hand_side=right_hand_side,

@@ -1,19 +1,24 @@
 """Stiffness of reduced bodies in modes on a GPU's tensor cores: the sums of ``samples`` in one kernel, K E kept near.
 
-A block of threads has two worlds, two warps for each. Eight samples at a time, and three rows of each, their E, which
-all worlds share, and K E lie in shared memory; the two warps of a world share the tiles, 16 x 8 modes, of the lower
-triangle of the ``E' (K E)`` that they add up in registers. Tensor cores take factors of 11 bits. Each number is
-therefore split into two, a = a1 + a2, and a b is a2 b1 + a1 b2 + a1 b1, so that what is left out is no larger than
-what a product of float32 rounds. They also round sums towards zero; so they only add up eight terms, and what comes
-of it is added as other numbers are. The order of sums is fixed and the same for every world.
-Theory: docs/theory/reduction.md.
+A block of threads has two worlds, two warps for each. It takes eight samples at a time, and two rows of each in a
+round. Their K E lie in shared memory; the two warps of a world share the tiles, 16 x 8 modes, of the lower triangle of
+the ``E' (K E)`` that they add up in registers. Tensor cores take factors of 11 bits. Each number is therefore the sum
+of two of float16, a = a1 + a2, and a b is a2 b1 + a1 b2 + a1 b1, so that what is left out is about what a product of
+float32 rounds. E is split ahead of time (``fragments``), in the order in which threads of a warp hold it; K E once by
+the thread that finds it. Powers of two bring both to where float16 has its range: one for E, and for K E of a world one
+for every round, from the largest entry of K in it. Tensor cores also round sums towards zero; so they only add up
+sixteen terms, and what comes of it is added as other numbers are. The order of sums is fixed and the same for
+every world. Theory: docs/theory/reduction.md.
 """
 
 import re
+from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
@@ -24,104 +29,110 @@ THREADS = 128  # of a block
 WIDEST = 96  # modes of a body, whose sums the registers of two warps hold
 OLDEST = 80  # compute capability from which tensor cores take numbers of float32's range
 BLOCKS = 2  # at once on a multiprocessor, which bounds the registers of a thread
+TOP = 14  # binary logarithm of the bound that factors of float16 are brought to
+TOGETHER = 8  # samples in a round
 
-# Samples of one kind, SIZE rows of E each. Columns in shared memory are swapped by sample, so that the threads of a
-# warp find them in different banks.
+# Samples of one kind, SIZE rows of E each. Rounds have two places for K, its largest entries and K E, so that warps
+# meet once in each. K of a sample lies column by column, two rows of both worlds beside each other.
 _ADD = """
 {
-const int most = COUNT;
+const int most = COUNT, rounds = (SIZE + 1) / 2, total = (most + 7) / 8 * rounds;
 const float* e = BASIS.data + E_FIRST;
+const uint4* halves = (const uint4*)HALVES.data;
 const long long across = STIFFNESS.strides[1] / sizeof(float);
 const float* k = &wp::index(STIFFNESS, group * 2 + (group * 2 + (thread & 1) < worlds ? (thread & 1) : 0), K_FIRST);
-float held[(48 * SIZE + 127) / 128];
-auto fetch = [&](int sample, int round) {
+float held[SIZE / 4 + 1];
+auto fetch = [&](int turn) {
+    const int sample = turn / rounds * 8, round = turn % rounds;
     #pragma unroll
-    for (int p = 0; p < (48 * SIZE + 127) / 128; ++p) {
-        const int q = (128 * p + thread) >> 1, t = q / (3 * SIZE), at = q % (3 * SIZE);
-        held[p] = q < 24 * SIZE && sample + t < most
-            ? k[((long long)(sample + t) * (SIZE * SIZE) + 3 * SIZE * round + at) * across] : 0.0f;
+    for (int p = 0; p < SIZE / 4 + 1; ++p) {
+        const int q = (128 * p + thread) >> 1, t = q / (2 * SIZE), at = q % (2 * SIZE);
+        held[p] = q < 16 * SIZE && sample + t < most && 2 * round + at / SIZE < SIZE
+            ? k[((long long)(sample + t) * (SIZE * SIZE) + 2 * SIZE * round + at) * across] : 0.0f;
     }
 };
-if (most > 0) fetch(0, 0);
-for (int sample = 0; sample < most; sample += 8) {
-    __syncthreads();
-    for (int q = thread; q < 8 * SIZE * QUADS; q += 128) {
-        const int row = q / QUADS, t = row / SIZE, c = 4 * (q - row * QUADS);
-        float4 piece = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-        if (sample + t < most) piece = ((const float4*)e)[(long long)sample * (SIZE * QUADS) + q];
-        *(float4*)&near_e[row * WIDE + (c ^ (8 * (t & 3)))] = piece;
+auto keep = [&](int place) {
+    unsigned largest = 0;
+    #pragma unroll
+    for (int p = 0; p < SIZE / 4 + 1; ++p) {
+        const int q = (128 * p + thread) >> 1, t = q / (2 * SIZE), at = q % (2 * SIZE);
+        if (q < 16 * SIZE) near_k[place][4 * (t * SIZE + at % SIZE) + 2 * (thread & 1) + at / SIZE] = held[p];
+        largest = max(largest, __float_as_uint(held[p]) & 0x7fffffffu);
     }
-    #pragma unroll 1
-    for (int round = 0; round < SIZE / 3; ++round) {
+    #pragma unroll
+    for (int far = 2; far < 32; far *= 2) largest = max(largest, __shfl_xor_sync(0xffffffffu, largest, far));
+    if ((thread & 31) < 2) near_most[place][4 * (thread & 1) + (thread >> 5)] = largest;
+};
+auto exponent = [&](int place, int world) {
+    unsigned largest = 0;
+    #pragma unroll
+    for (int q = 0; q < 4; ++q) largest = max(largest, near_most[place][4 * world + q]);
+    return max((int)(__float_as_uint(__uint_as_float(largest) * (SIZE * MOST)) >> 23) & 255, 20);
+};
+__syncthreads();
+if (total > 0) {
+    fetch(0);
+    keep(0);
+    fetch(1);
+}
+__syncthreads();
+for (int turn = 0; turn < total; ++turn) {
+    const int sample = turn / rounds * 8, place = turn & 1, t = thread >> 4, c = 2 * (thread & 15);
+    const float back = __uint_as_float((unsigned)(exponent(place, thread >> 6) + 1 - TOP) << 23) * BACK;
+    {
+        const float* mine = e + (long long)(sample + t < most ? sample + t : 0) * (SIZE * MODES) + c;
+        float2 s[4][PIECES];
         #pragma unroll
-        for (int p = 0; p < (48 * SIZE + 127) / 128; ++p) {
-            const int q = (128 * p + thread) >> 1, t = q / (3 * SIZE), at = q % (3 * SIZE);
-            if (q < 24 * SIZE) near_k[3 * (((thread & 1) * 8 + t) * SIZE + at % SIZE) + at / SIZE] = held[p];
-        }
-        __syncthreads();
-        {
-            const int t = (thread >> 3) & 7, turn = 8 * (t & 3);
-            const float* mine = &near_e[t * SIZE * WIDE];
-            const float* row = &near_k[3 * ((thread >> 6) * 8 + t) * SIZE];
-            float4 s[3][PIECES];
+        for (int i = 0; i < 4; ++i)
             #pragma unroll
-            for (int i = 0; i < 3; ++i)
-                #pragma unroll
-                for (int p = 0; p < PIECES; ++p) s[i][p] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+            for (int p = 0; p < PIECES; ++p) s[i][p] = make_float2(0.0f, 0.0f);
+        #pragma unroll
+        for (int a = 0; a < SIZE; ++a) {
+            const float4 g = *(const float4*)&near_k[place][4 * (t * SIZE + a)];
             #pragma unroll
-            for (int a = 0; a < SIZE; ++a) {
-                #pragma unroll
-                for (int p = 0; p < PIECES; ++p) {
-                    const int c = 4 * ((thread & 7) + 8 * p);
-                    if (c < MODES) {
-                        const float4 x = *(const float4*)&mine[a * WIDE + (c ^ turn)];
-                        #pragma unroll
-                        for (int i = 0; i < 3; ++i) {
-                            const float g = row[3 * a + i];
-                            s[i][p].x += g * x.x;
-                            s[i][p].y += g * x.y;
-                            s[i][p].z += g * x.z;
-                            s[i][p].w += g * x.w;
-                        }
-                    }
-                }
-            }
-            #pragma unroll
-            for (int i = 0; i < 3; ++i)
-                #pragma unroll
-                for (int p = 0; p < PIECES; ++p) {
-                    const int c = 4 * ((thread & 7) + 8 * p);
-                    if (c < MODES) *(float4*)&near_y[(((thread >> 6) * 3 + i) * 8 + t) * WIDE + (c ^ turn)] = s[i][p];
+            for (int p = 0; p < PIECES; ++p)
+                if (c + 32 * p < MODES) {
+                    const float2 x = *(const float2*)&mine[a * MODES + 32 * p];
+                    s[0][p].x += g.x * x.x, s[0][p].y += g.x * x.y;
+                    s[1][p].x += g.y * x.x, s[1][p].y += g.y * x.y;
+                    s[2][p].x += g.z * x.x, s[2][p].y += g.z * x.y;
+                    s[3][p].x += g.w * x.x, s[3][p].y += g.w * x.y;
                 }
         }
-        __syncthreads();
-        if (round + 1 < SIZE / 3) fetch(sample, round + 1);
-        else fetch(sample + 8, 0);
-        if (side == 0) {
-            MULTIPLY_0
-        } else {
-            MULTIPLY_1
+        #pragma unroll
+        for (int world = 0; world < 2; ++world) {
+            const float scale = __uint_as_float((unsigned)(253 + TOP - exponent(place, world)) << 23);
+            #pragma unroll
+            for (int p = 0; p < PIECES; ++p)
+                if (c + 32 * p < MODES) {
+                    uint2 head, tail;
+                    split(s[2 * world][p].x * scale, s[2 * world + 1][p].x * scale, head.x, tail.x);
+                    split(s[2 * world][p].y * scale, s[2 * world + 1][p].y * scale, head.y, tail.y);
+                    *(uint2*)&near_y[place][world][t][c + 32 * p] = head;
+                    *(uint2*)&near_y[place][world][8 + t][c + 32 * p] = tail;
+                }
         }
+    }
+    keep(place ^ 1);
+    __syncthreads();
+    if (turn + 2 < total) fetch(turn + 2);
+    const uint4* x = halves + (long long)turn * (64 * ROWS) + (thread & 31);
+    const unsigned* y = &near_y[place][thread >> 6][lane][high];
+    uint4 a1[OWN], a2[OWN];
+    unsigned b1[2], b2[2];
+    if (side == 0) {
+        MULTIPLY_0
+    } else {
+        MULTIPLY_1
     }
 }
 }
 """
 
-# What one warp does with the three rows; then come ``_COLUMNS``, with a ``_PRODUCT`` for each tile.
-_MULTIPLY = """
-#pragma unroll 1
-for (int i = 0; i < 3; ++i) {
-    const float* x = &near_e[(lane * SIZE + 3 * round + i) * WIDE];
-    const float* y = &near_y[(((thread >> 6) * 3 + i) * 8 + lane) * WIDE];
-    unsigned a1[OWN][4], a2[OWN][4], b1[2], b2[2];
-    LOADS
-    COLUMNS
-}
-"""
-_LOAD = "split(x[PART * 4 * SIZE * WIDE + FAR + place[TURN]], a1[M][Q], a2[M][Q]);"
+# What one warp does in a round: its rows of tiles of E, then column by column K E, and a ``_PRODUCT`` for each tile.
+_LOAD = "a1[M] = x[64 * ROW], a2[M] = x[64 * ROW + 32];"
 _COLUMN = """
-split(y[FAR + place[TURN]], b1[0], b2[0]);
-split(y[4 * WIDE + FAR + place[TURN]], b1[1], b2[1]);
+b1[0] = y[8 * J], b1[1] = y[4 * WIDE + 8 * J], b2[0] = y[8 * WIDE + 8 * J], b2[1] = y[12 * WIDE + 8 * J];
 """
 _PRODUCT = """
 {
@@ -129,7 +140,7 @@ _PRODUCT = """
     multiply(d, a2[M], b1, zero);
     multiply(d, a1[M], b2, d);
     multiply(d, a1[M], b1, d);
-    s[M][J][0] += d[0], s[M][J][1] += d[1], s[M][J][2] += d[2], s[M][J][3] += d[3];
+    s[M][J][0] += d[0] * back, s[M][J][1] += d[1] * back, s[M][J][2] += d[2] * back, s[M][J][3] += d[3] * back;
 }
 """
 _WRITE = "out[((ROW + high) * MODES + COLUMN + 2 * lane) * down] = s[M][J][Q];"
@@ -138,22 +149,21 @@ _ALL = """
 const int worlds = sum_out.shape[0];
 #if defined(__CUDA_ARCH__)
 #if __CUDA_ARCH__ >= 800
-__shared__ __align__(16) float near_e[72 * WIDE];
-__shared__ __align__(16) float near_y[48 * WIDE];
-__shared__ __align__(16) float near_k[432];
+__shared__ __align__(16) unsigned near_y[2][2][16][WIDE];
+__shared__ __align__(16) float near_k[2][288];
+__shared__ unsigned near_most[2][8];
 const int high = (thread & 31) >> 2, lane = thread & 3, side = (thread >> 5) & 1;
-int place[4];
-#pragma unroll
-for (int q = 0; q < 4; ++q) place[q] = ((8 * q) ^ (8 * lane)) + high;
-auto split = [](float value, unsigned& head, unsigned& tail) {
-    head = (__float_as_uint(value) + 0x1000u) & 0xffffe000u;
-    tail = __float_as_uint(value - __uint_as_float(head));
+auto split = [](float low, float up, unsigned& head, unsigned& tail) {
+    float a, b;
+    asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(head) : "f"(up), "f"(low));
+    asm("{.reg .f16 l, h; mov.b32 {l, h}, %2; cvt.f32.f16 %0, l; cvt.f32.f16 %1, h;}" : "=f"(a), "=f"(b) : "r"(head));
+    asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(tail) : "f"(up - b), "f"(low - a));
 };
-auto multiply = [](float* d, const unsigned* a, const unsigned* b, const float* c) {
-    asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
+auto multiply = [](float* d, const uint4& a, const unsigned* b, const float* c) {
+    asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
         "{%10, %11, %12, %13};"
         : "=f"(d[0]), "=f"(d[1]), "=f"(d[2]), "=f"(d[3])
-        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b[0]), "r"(b[1]), "f"(c[0]), "f"(c[1]), "f"(c[2]),
+        : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b[0]), "r"(b[1]), "f"(c[0]), "f"(c[1]), "f"(c[2]),
           "f"(c[3]));
 };
 float s[OWN][TILES][4] = {};
@@ -209,16 +219,11 @@ def _filled(text: str, **values: int | str) -> str:
 
 def _multiply(rows: list[int]) -> str:
     """How a warp multiplies for its rows of tiles."""
-    loads = [
-        _filled(_LOAD, PART=q // 2, FAR=16 * row // 32 * 32, TURN=2 * row % 4 + q % 2, M=m, Q=q)
-        for m, row in enumerate(rows)
-        for q in range(4)
-    ]
-    columns = []
+    lines = [_filled(_LOAD, ROW=row, M=m) for m, row in enumerate(rows)]
     for j in range(2 * max(rows, default=-1) + 2):
-        columns.append(_filled(_COLUMN, FAR=8 * j // 32 * 32, TURN=j % 4))
-        columns += [_filled(_PRODUCT, M=m, J=j) for m, row in enumerate(rows) if j < 2 * row + 2]
-    return _filled(_MULTIPLY, LOADS="\n    ".join(loads), COLUMNS="".join(columns)) if rows else ""
+        lines.append(_filled(_COLUMN, J=j))
+        lines += [_filled(_PRODUCT, M=m, J=j) for m, row in enumerate(rows) if j < 2 * row + 2]
+    return "\n".join(lines)
 
 
 def _write(rows: list[int]) -> str:
@@ -237,13 +242,49 @@ def _source(modes: int) -> str:
     parts = {f"MULTIPLY_{side}": _multiply(rows) for side, rows in enumerate(both)}
     add = _filled(_ADD, **parts)
     tets = _filled(add, COUNT="tet_count", BASIS="tet_basis", E_FIRST="tet_at", STIFFNESS="stiffness_in")
-    tets = _filled(tets, K_FIRST="tet_first", SIZE=TET)
+    tets = _filled(tets, HALVES="tet_halves", K_FIRST="tet_first", MOST="tet_most", BACK="tet_back", SIZE=TET)
     tris = _filled(add, COUNT="tri_count", BASIS="tri_basis", E_FIRST="tri_at", STIFFNESS="thin_in")
-    tris = _filled(tris, K_FIRST="tri_first", SIZE=TRI)
+    tris = _filled(tris, HALVES="tri_halves", K_FIRST="tri_first", MOST="tri_most", BACK="tri_back", SIZE=TRI)
     text = _filled(_ALL, ADD_TETS=tets, ADD_TRIS=tris, WRITE_0=_write(both[0]), WRITE_1=_write(both[1]))
-    wide, quads = -(-modes // 32) * 32, modes // 4
-    text = _filled(text, WIDE=wide, QUADS=quads, PIECES=-(-quads // 8), MODES=modes)
+    pieces = -(-modes // 32)
+    text = _filled(text, WIDE=32 * pieces + 8, PIECES=pieces, MODES=modes, TOP=TOP, ROWS=modes // 16)
     return _filled(text, OWN=max(map(len, both)), TILES=modes // 8)
+
+
+@dataclass(frozen=True)
+class Fragments:
+    """Rows E of the samples of one kind in one body, as tensor cores take them.
+
+    Attributes:
+        halves: Pairs of float16, those of two rows: (round, tile of 16 modes, head or tail, thread of a warp, 4).
+        most: Largest entry of E.
+        back: What their sums are multiplied by.
+    """
+
+    halves: npt.NDArray[np.int32]
+    most: float
+    back: float
+
+
+def fragments(basis: npt.NDArray[np.float32]) -> Fragments:
+    """Split E, shape (sample, row, mode); samples are filled up to eight, rows to pairs, with zeros."""
+    count, size, modes = basis.shape
+    most = float(np.abs(basis).max(initial=0.0))
+    scale = 2.0 ** (TOP - int(np.frexp(most)[1]))
+    stages, rounds, tiles = -(-count // TOGETHER), -(-size // 2), modes // 16
+    rows = np.zeros((stages * TOGETHER, 2 * rounds, modes), dtype=np.float32)
+    rows[:count, :size] = basis * np.float32(scale)
+    heads = rows.astype(np.float16)
+    halves = np.zeros((stages, rounds, tiles, 2, 32, 4, 2), dtype=np.float16)
+    thread = np.arange(32)
+    for number, part in enumerate((heads, (rows - heads).astype(np.float16))):
+        split = part.reshape(stages, TOGETHER, rounds, 2, tiles, 16)
+        for q in range(4):
+            sample, mode = thread % 4 + 4 * (q // 2), thread // 4 + 8 * (q % 2)
+            for row in range(2):
+                halves[:, :, :, number, :, q, row] = np.moveaxis(split[:, sample, :, row, :, mode], 0, -1)
+    whole = halves.ravel() if count else np.zeros(8, dtype=np.float16)
+    return Fragments(whole.view(np.int32), most, 1.0 / scale)
 
 
 def serves(device: Any, precision: str, widest: int) -> bool:
@@ -267,8 +308,14 @@ def kernels(variant: Variant, modes: int) -> SimpleNamespace:
         tri_at: int,
         tri_first: int,
         sum_first: int,
+        tet_most: float,
+        tet_back: float,
+        tri_most: float,
+        tri_back: float,
         tet_basis: wp.array(dtype=wp.float32),
         tri_basis: wp.array(dtype=wp.float32),
+        tet_halves: wp.array(dtype=wp.int32),
+        tri_halves: wp.array(dtype=wp.int32),
         stiffness_in: wp.array2d(dtype=wp.float32),
         thin_in: wp.array2d(dtype=wp.float32),
         sum_out: wp.array2d(dtype=wp.float32),
@@ -283,9 +330,15 @@ def kernels(variant: Variant, modes: int) -> SimpleNamespace:
         tri_at: int,
         tri_first: int,
         sum_first: int,
+        tet_most: float,
+        tet_back: float,
+        tri_most: float,
+        tri_back: float,
         # Model
         tet_basis: wp.array(dtype=wp.float32),
         tri_basis: wp.array(dtype=wp.float32),
+        tet_halves: wp.array(dtype=wp.int32),
+        tri_halves: wp.array(dtype=wp.int32),
         # Workspace in
         stiffness_in: wp.array2d(dtype=wp.float32),
         thin_in: wp.array2d(dtype=wp.float32),
@@ -294,7 +347,8 @@ def kernels(variant: Variant, modes: int) -> SimpleNamespace:
     ):
         """Stiffness in modes of one body for a group of worlds, on and below its diagonal.
 
-        Of tets, and then of triangles: how many, their first entry among ``tet_basis`` and among ``stiffness_in``.
+        Of tets, and then of triangles: how many, their first entry among ``tet_basis`` and among ``stiffness_in``; and
+        of what ``fragments`` made of both their E the largest entry, and what sums are multiplied by.
         """
         group, thread = wp.tid()
         add_up(
@@ -307,8 +361,14 @@ def kernels(variant: Variant, modes: int) -> SimpleNamespace:
             tri_at,
             tri_first,
             sum_first,
+            tet_most,
+            tet_back,
+            tri_most,
+            tri_back,
             tet_basis,
             tri_basis,
+            tet_halves,
+            tri_halves,
             stiffness_in,
             thin_in,
             sum_out,

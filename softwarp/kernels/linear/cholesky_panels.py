@@ -15,6 +15,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.algebra.team import exchange_code
 from softwarp.model.codes import PANEL_FIRST_STEP, PANEL_IDENTITY, PANEL_UPDATE
 
 THREADS = 512  # per block, at most; benchmarks/trunk.py
@@ -45,20 +46,6 @@ _BARRIER = """
 __syncthreads();
 #else
 WP_TILE_SYNC();
-#endif
-"""
-
-_EXCHANGE = """
-#if defined(__CUDA_ARCH__)
-return __shfl_xor_sync(0xffffffffu, value, offset);
-#else
-if (WP_TILE_BLOCK_DIM == 1) return value;
-static SCALAR slots[1024];
-slots[WP_TILE_THREAD_IDX] = value;
-WP_TILE_SYNC();
-const SCALAR result = slots[WP_TILE_THREAD_IDX ^ offset];
-WP_TILE_SYNC();
-return result;
 #endif
 """
 
@@ -115,11 +102,6 @@ return (SCALAR)1 / ::sqrt(x);
 @wp.func_native(_BARRIER)
 def barrier():
     """Wait for all threads of the block; their writes are visible after it."""
-
-
-def exchange_code(real: Any) -> str:
-    """Native code of the value of the thread whose number differs in the bits of ``offset``."""
-    return _EXCHANGE.replace("SCALAR", name_of(real))
 
 
 def shared_memory(real: Any, count: int) -> str:

@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear.cholesky_panels import THREADS, barrier, exchange_code, shared_memory
+from softwarp.kernels.algebra.team import exchange_code
+from softwarp.kernels.linear.cholesky_panels import THREADS, barrier, shared_memory
 
 WARP = 32  # threads of a warp
 MOST_ROWS = 48  # cables of a scene whose W the block keeps in shared memory

@@ -19,6 +19,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import team
 from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant
 from softwarp.model.codes import UNBOUNDED, CavityControl
 
@@ -128,6 +129,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
         point_gradient_out[w, p + 1] = g1 * sixth
         point_gradient_out[w, p + 2] = g2 * sixth
 
+    @wp.func
+    def moment(
+        point_x: wp.array2d(dtype=S),
+        point_gradient: wp.array2d(dtype=S),
+        w: int,
+        first: int,
+        begin: int,
+        end: int,
+        step: int,
+    ):
+        """Sum of (x_p - x_0) . dV/dx_p over some points of a chamber, whose first is x_0."""
+        total = S(real(0.0))
+        for p in range(begin, end, step):
+            for c in range(3):
+                offset = point_x[w, 3 * p + c] - point_x[w, 3 * first + c]
+                total += mul(offset, point_gradient[w, 3 * p + c])
+        return total
+
     @wp.kernel(module=module, enable_backward=False)
     def cavity_volume(
         # Model
@@ -143,12 +162,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         w, cavity = wp.tid()
         if wp.static(world_fastest):
             cavity, w = wp.tid()
-        begin = cavity_point_start[cavity]
-        total = S(real(0.0))
-        for p in range(begin + 1, cavity_point_start[cavity + 1]):
-            for c in range(3):
-                offset = point_x_in[w, 3 * p + c] - point_x_in[w, 3 * begin + c]
-                total += mul(offset, point_gradient_in[w, 3 * p + c])
+        first = cavity_point_start[cavity]
+        total = moment(point_x_in, point_gradient_in, w, first, first + 1, cavity_point_start[cavity + 1], 1)
         volume_out[w, first_row + cavity] = total * (real(1.0) / real(3.0))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -414,7 +429,35 @@ def kernels(variant: Variant) -> SimpleNamespace:
             cavity, w = wp.tid()
         multiplier_out[w, first_row + cavity] = pressure_in[w, cavity] * cavity_area[cavity]
 
+    found = {}
+    if world_fastest:
+        seat, whole = vars(team.functions(variant)).values()
+
+        @wp.kernel(module=module, enable_backward=False)
+        def share_volume(
+            parts: int,
+            # Model
+            first_row: int,
+            cavity_point_start: wp.array(dtype=wp.int32),
+            # Workspace in
+            point_x_in: wp.array2d(dtype=S),
+            point_gradient_in: wp.array2d(dtype=S),
+            # Workspace out
+            volume_out: wp.array2d(dtype=S),
+        ):
+            """``cavity_volume`` where some threads of a GPU share the points of a chamber."""
+            group = wp.tid()
+            cavity, world, part = seat(group, cavity_point_start.shape[0] - 1, parts)
+            w = wp.min(world, point_x_in.shape[0] - 1)  # all threads of a warp take part in its exchanges
+            first = cavity_point_start[cavity]
+            last = cavity_point_start[cavity + 1]
+            total = whole(moment(point_x_in, point_gradient_in, w, first, first + 1 + part, last, parts), parts)
+            if part == 0 and world < point_x_in.shape[0]:
+                volume_out[w, first_row + cavity] = total * (real(1.0) / real(3.0))
+
+        found["share_volume"] = share_volume
     return SimpleNamespace(
+        **found,
         to_row=to_row,
         scale_gradient=scale_gradient,
         pressure_of_row=pressure_of_row,

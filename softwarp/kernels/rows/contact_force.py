@@ -11,6 +11,8 @@ from softwarp.model.codes import SLOTS
 
 CHUNK = 8  # slots whose loop the compiler unrolls; a part of SLOTS
 HELD = 24  # slots that a thread may have found before it adds them
+SHARING = 32  # threads that share the dofs of a world, a power of two
+ALL_BITS = 2**31 - 1
 
 
 @cache
@@ -87,6 +89,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         held: Held,
         count: int,
         dof_free: wp.array2d(dtype=real),
+        dofs: wp.array3d(dtype=wp.int32),
         weight: wp.array3d(dtype=real),
         lever: wp.array3d(dtype=real),
         axes: wp.array3d(dtype=real),
@@ -94,14 +97,68 @@ def kernels(variant: Variant) -> SimpleNamespace:
         f_scale: real,
         pack: int,
         lane: int,
-        dof: int,
         target_out: wp.array3d(dtype=real),
     ):
-        """Add the forces of contacts on a dof at the slots that are held, in their order."""
+        """Add the forces of contacts on dofs at the slots that are held, in their order."""
         for k in range(count):
+            dof = dofs[pack, held[k], lane]
             contact = held[k] // wp.static(SLOTS)
             slot = held[k] % wp.static(SLOTS)
             add_slot(dof_free, weight, lever, axes, multiplier, f_scale, pack, lane, contact, slot, dof, target_out)
+
+    @wp.func
+    def add_own_slots(
+        dof_free: wp.array2d(dtype=real),
+        count: int,
+        dofs: wp.array3d(dtype=wp.int32),
+        weight: wp.array3d(dtype=real),
+        lever: wp.array3d(dtype=real),
+        axes: wp.array3d(dtype=real),
+        multiplier: wp.array3d(dtype=real),
+        f_scale: real,
+        pack: int,
+        lane: int,
+        own: int,
+        mask: int,
+        target_out: wp.array3d(dtype=real),
+    ):
+        """Add the forces of contacts on dofs whose bits of ``mask`` are those of ``own``.
+
+        A warp waits for the thread in it that has something to add, so slots are searched first and added then.
+        Slots are filled from the first one on.
+        """
+        held = Held()
+        found = int(0)
+        for contact in range(count):
+            first = wp.static(SLOTS) * contact
+            end = first + wp.static(SLOTS)
+            while first < end:
+                last = int(-1)
+                for place in range(wp.static(CHUNK)):  # unrolled: these loads do not wait for each other
+                    last = dofs[pack, first + place, lane]
+                    if last >= 0 and last & mask == own:
+                        held[found] = first + place
+                        found += 1
+                if found > wp.static(HELD - CHUNK):
+                    add_slots(
+                        held,
+                        found,
+                        dof_free,
+                        dofs,
+                        weight,
+                        lever,
+                        axes,
+                        multiplier,
+                        f_scale,
+                        pack,
+                        lane,
+                        target_out,
+                    )
+                    found = 0
+                first += wp.static(CHUNK)
+                if last < 0:
+                    first = end
+        add_slots(held, found, dof_free, dofs, weight, lever, axes, multiplier, f_scale, pack, lane, target_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def gather_force(
@@ -121,56 +178,60 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """The same with a thread for every dof, for GPUs, where one for all of a world waits for each of its sums.
 
-        A warp waits for the world in it that has something to add, so slots are searched first and added then.
-        Slots are filled from the first one on. Nobody asks for forces in idle worlds.
+        Nobody asks for forces in idle worlds.
         """
         pack, dof, lane = wp.tid()
-        if idle_in[pack, 0, lane] != 0:
-            return
-        held = Held()
-        found = int(0)
-        for contact in range(count_in[pack, 0, lane]):
-            first = wp.static(SLOTS) * contact
-            end = first + wp.static(SLOTS)
-            while first < end:
-                last = int(-1)
-                for place in range(wp.static(CHUNK)):  # unrolled: these loads do not wait for each other
-                    last = dof_in[pack, first + place, lane]
-                    if last == dof:
-                        held[found] = first + place
-                        found += 1
-                if found > wp.static(HELD - CHUNK):
-                    add_slots(
-                        held,
-                        found,
-                        dof_free,
-                        weight_in,
-                        lever_in,
-                        axes_in,
-                        multiplier_in,
-                        f_scale,
-                        pack,
-                        lane,
-                        dof,
-                        target_out,
-                    )
-                    found = 0
-                first += wp.static(CHUNK)
-                if last < 0:
-                    first = end
-        add_slots(
-            held,
-            found,
-            dof_free,
-            weight_in,
-            lever_in,
-            axes_in,
-            multiplier_in,
-            f_scale,
-            pack,
-            lane,
-            dof,
-            target_out,
-        )
+        if idle_in[pack, 0, lane] == 0:
+            add_own_slots(
+                dof_free,
+                count_in[pack, 0, lane],
+                dof_in,
+                weight_in,
+                lever_in,
+                axes_in,
+                multiplier_in,
+                f_scale,
+                pack,
+                lane,
+                dof,
+                wp.static(ALL_BITS),
+                target_out,
+            )
 
-    return SimpleNamespace(add_force=add_force, gather_force=gather_force)
+    @wp.kernel(module=module, enable_backward=False)
+    def share_force(
+        threads: int,
+        # Model
+        dof_free: wp.array2d(dtype=real),
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        idle_in: wp.array3d(dtype=wp.int32),
+        dof_in: wp.array3d(dtype=wp.int32),
+        weight_in: wp.array3d(dtype=real),
+        lever_in: wp.array3d(dtype=real),
+        axes_in: wp.array3d(dtype=real),
+        multiplier_in: wp.array3d(dtype=real),
+        f_scale: real,
+        # Workspace out
+        target_out: wp.array3d(dtype=real),
+    ):
+        """The same where a world's threads are neighbours: a thread has some of many dofs, which few contacts touch."""
+        pack, lane, thread = wp.tid()
+        if idle_in[pack, 0, lane] == 0:
+            add_own_slots(
+                dof_free,
+                count_in[pack, 0, lane],
+                dof_in,
+                weight_in,
+                lever_in,
+                axes_in,
+                multiplier_in,
+                f_scale,
+                pack,
+                lane,
+                thread,
+                threads - 1,
+                target_out,
+            )
+
+    return SimpleNamespace(add_force=add_force, gather_force=gather_force, share_force=share_force)

@@ -124,6 +124,7 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
     Sums = wp.types.vector(3 * axes, dtype=S)
     block = cholesky_panels.kernels(variant).block
     vec = wp.types.vector(3, dtype=S)
+    Side = wp.types.vector(9, dtype=S)
     Touch, first_dof, own_axes, mode_row = vars(touch.functions(variant)).values()
     slot_row, real = contact_rows.kernels(variant, together=True).slot_row, variant.real
 
@@ -224,7 +225,8 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
     ):
         """Y_c = P H_c' of one contact: ``scatter_rows`` of ``contact``, where threads share the modes of a body.
 
-        A block of modes has the same thread in every slot, and so has a dof that is none.
+        A block of modes has the same thread in every slot, which keeps its sum meanwhile, and so has a dof that is
+        none. Slots are filled from the first one on.
         """
         w, c, thread = wp.tid()
         if c < pack_first_in[w, 0] or c >= pack_count_in[w, 0]:
@@ -235,7 +237,11 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
             pack = int(0)
             lane = w
         start = 9 * c * path_limit
-        for slot in range(int(wp.static(SLOTS))):
+        held = int(-1)  # block whose entries are in ``side``
+        at = int(0)
+        side = Side()
+        slot = int(0)
+        while slot < wp.static(SLOTS):
             dof = dof_in[w, wp.static(SLOTS) * c + slot]
             if dof >= size:
                 node = dof - size
@@ -246,14 +252,21 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                 own1 = own_axes(modes, node, n1, pack, lane)
                 own2 = own_axes(modes, node, n2, pack, lane)
                 for p in range(modes.begin[node] + thread, modes.end[node], wp.static(SPREAD)):
-                    t = start + 9 * place_in[w, c * size + modes.dof[p]]
+                    if p != held:
+                        if held >= 0:
+                            for k in range(9):
+                                side_out[w, at + k] = side[k]
+                        held = p
+                        at = start + 9 * place_in[w, c * size + modes.dof[p]]
+                        for k in range(9):
+                            side[k] = side_out[w, at + k]
                     h0 = mode_row(modes, p, node, n0, own0, pack, lane)
                     h1 = mode_row(modes, p, node, n1, own1, pack, lane)
                     h2 = mode_row(modes, p, node, n2, own2, pack, lane)
                     for r in range(3):
-                        side_out[w, t + 3 * r] += h0[r]
-                        side_out[w, t + 3 * r + 1] += h1[r]
-                        side_out[w, t + 3 * r + 2] += h2[r]
+                        side[3 * r] += h0[r]
+                        side[3 * r + 1] += h1[r]
+                        side[3 * r + 2] += h2[r]
             elif dof >= 0 and dof % wp.static(SPREAD) == thread:
                 place = place_in[w, c * size + dof]
                 if place >= 0:
@@ -261,6 +274,10 @@ def kernels(variant: Variant, wide: bool = False) -> SimpleNamespace:
                         h = slot_row(weight_in, lever_in, axes_in, pack, lane, c, slot, axis)
                         for r in range(3):
                             side_out[w, start + 9 * place + 3 * r + axis] += h[r] * dof_free[dof, r]
+            slot = wp.where(dof < 0, wp.static(SLOTS), slot + 1)
+        if held >= 0:
+            for k in range(9):
+                side_out[w, at + k] = side[k]
 
     sizes = {"SCALAR": name_of(S), "DOFS": str(NEAR_DOFS[name_of(S)])}
     sizes |= {"NEAR": str(NEAR), "GROUP": str(NEAR_GROUP), "THREADS": str(THREADS)}

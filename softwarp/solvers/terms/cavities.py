@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warp as wp
+
+from softwarp.kernels.algebra import team
 from softwarp.kernels.frames import momentum
 from softwarp.kernels.rows import cavity, cavity_surface
 from softwarp.model.cavities import CavityModel
@@ -56,7 +59,11 @@ class CavityTerm(Term):
         inputs = [self.first_point, m.ring_start, m.point_ring, w.point_x.S]
         s.each(self.k.cavity_gradient, self.points, inputs, [w.point_gradient.S])
         inputs = [0, m.cavity_point_start, w.point_x.S, w.point_gradient.S]
-        s.each(self.k.cavity_volume, m.count, inputs, [w.cavity_volume.S])
+        if s.variant.world_fastest:
+            parts, threads = team.team(s.device, s.width, m.count)
+            wp.launch(self.k.share_volume, threads, [parts, *inputs], [w.cavity_volume.S], device=s.device)
+        else:
+            s.each(self.k.cavity_volume, m.count, inputs, [w.cavity_volume.S])
         if scaled:
             inputs = [self.first_point, m.cavity_area, m.point_cavity]
             s.each(self.k.scale_gradient, self.points, inputs, [w.point_gradient.S])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from softwarp.kernels.elements import mode_loads, mode_places, reduction, samples, tensor_sums
+from softwarp.kernels.elements import mode_places, reduction, samples, tensor_sums
 from softwarp.kernels.frames import momentum
 from softwarp.model.reduction import ReductionModel
+from softwarp.solvers.subspace import each_load
 from softwarp.solvers.terms.floating import FloatingFrames
 from softwarp.solvers.terms.term import Term
 from softwarp.solvers.workspace.rows import Rows
@@ -34,6 +35,8 @@ class ReductionTerm(Term):
         self.frames = None if floating is None else FloatingFrames(shard, model, floating)
         self.takes_stored = floating is None and not model.tet_turned.numpy().any()
         self.tets, self.tris = int(model.tet_samples[-1]), int(model.tri_samples[-1])
+        self.is_near = tensor_sums.serves(shard.device, shard.model.precision, model.widest)
+        self.fragments = self._split() if self.is_near else []
 
     def load(self) -> None:
         """Amplitudes, and the nodes that a step needs."""
@@ -113,7 +116,7 @@ class ReductionTerm(Term):
 
     def _gather(self) -> None:
         """Their sum on a GPU."""
-        if tensor_sums.serves(self.shard.device, self.shard.model.precision, self.model.widest):
+        if self.is_near:
             self._gather_near()
             return
         s, m, w, k = self.shard, self.model, self.shard.work, self.k_sample
@@ -131,6 +134,25 @@ class ReductionTerm(Term):
                 s.each(k.whole_product, squares, inputs, [w.mode_sum.S])
             more = True
 
+    def _split(self) -> list[tuple[list[float], list[wp.array]]]:
+        """What tensor cores take of each body's samples: numbers and arrays, of tets and then of triangles."""
+        m, device, found = self.model, self.shard.device, []
+        first = [0, 0]
+        for body, modes in enumerate(m.stride.tolist()):
+            numbers: list[float] = []
+            arrays: list[wp.array] = []
+            for kind, (size, samples_of, basis) in enumerate(
+                ((samples.TET, m.tet_samples, m.tet_basis), (samples.TRI, m.tri_samples, m.tri_basis))
+            ):
+                count = int(samples_of[body + 1] - samples_of[body])
+                rows = basis.numpy()[first[kind] : first[kind] + count * size * modes]
+                parts = tensor_sums.fragments(rows.reshape(count, size, modes))
+                numbers += [parts.most, parts.back]
+                arrays.append(wp.array(parts.halves, dtype=wp.int32, device=device))
+                first[kind] += rows.size
+            found.append((numbers, arrays))
+        return found
+
     def _gather_near(self) -> None:
         """The same on tensor cores, body after body."""
         s, m, w = self.shard, self.model, self.shard.work
@@ -138,8 +160,9 @@ class ReductionTerm(Term):
         for body, modes in enumerate(m.stride.tolist()):
             tet, tri = int(m.tet_samples[body]), int(m.tri_samples[body])
             tets, tris = int(m.tet_samples[body + 1]) - tet, int(m.tri_samples[body + 1]) - tri
-            inputs = [tets, tet_at, samples.TET**2 * tet, tris, tri_at, samples.TRI**2 * tri, sum_first]
-            inputs += [m.tet_basis, m.tri_basis, w.sample_stiffness.S, w.thin_stiffness.S]
+            numbers, arrays = self.fragments[body]
+            inputs = [tets, tet_at, samples.TET**2 * tet, tris, tri_at, samples.TRI**2 * tri, sum_first, *numbers]
+            inputs += [m.tet_basis, m.tri_basis, *arrays, w.sample_stiffness.S, w.thin_stiffness.S]
             kernel, groups = tensor_sums.kernels(s.variant, modes).stiffness, -(-s.width // tensor_sums.GROUP)
             dim, block = (groups, tensor_sums.THREADS), tensor_sums.THREADS
             wp.launch(kernel, dim, inputs, [w.mode_sum.S], device=s.device, block_dim=block)
@@ -156,8 +179,7 @@ class ReductionTerm(Term):
         if self.frames is not None:
             self.frames.turn_loads()
         inputs = [m.body_node, m.order, m.node_basis, m.node_body, m.body_wide, m.body_stride, m.wide_body, m.basis]
-        items = m.wide_count // mode_loads.GROUP if s.variant.world_fastest else len(m.body)
-        s.each(self.k.add_forces, items, [*inputs, w.listed_force.S], [w.wide_force.S])
+        each_load(s, self.k.add_forces, m.wide_count, len(m.body), [*inputs, w.listed_force.S], [w.wide_force.S])
         if self.frames is not None:
             self.frames.rigid_loads()
         s.each(self.k.narrow, m.count, [m.mode_wide, w.wide_force.S], [w.mode_force.S])
@@ -174,9 +196,9 @@ class ReductionTerm(Term):
         """Entries of rows at modes."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [m.row_body, m.row_point, m.row_points, m.row_basis, m.row_wide, m.wide_row, m.body_stride]
-        items = int(m.wide_row.size) // mode_loads.GROUP if s.variant.world_fastest else int(m.row_body.size)
         gradient = w.point_gradient.S if self.frames is None else self.frames.gradients()
-        s.each(self.k.mode_rows, items, [*inputs, m.point_basis, gradient], [w.wide_row.S])
+        modes, rows = int(m.wide_row.size), int(m.row_body.size)
+        each_load(s, self.k.mode_rows, modes, rows, [*inputs, m.point_basis, gradient], [w.wide_row.S])
         if self.frames is not None:
             self.frames.rows()
         inputs = [s.model.dof_count, m.entry, m.entry_wide, s.model.entry_dof, s.model.entry_row, w.wide_row.S]

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from softwarp import meshing
-from softwarp.kernels.algebra import lanes
+from softwarp.kernels.algebra import lanes, team
 from softwarp.kernels.rows import cavity
 from softwarp.model.codes import CAVITY_CONTROLS, UNBOUNDED
 from softwarp.solvers.workspace import rows
@@ -359,3 +359,20 @@ def test_sealed_gas_balances_a_piston():
         p = (row.target - V + W * p_balance) / (W + row.compliance)
         V = V0 + W * p
     np.testing.assert_allclose(p, ambient * (G / V) ** kappa - ambient, rtol=1e-12)
+
+
+@pytest.mark.parametrize("parts", [1, team.PARTS])
+def test_threads_of_a_gpu_share_a_volume(parts, monkeypatch):
+    """Two chambers of eleven worlds, to rounding as a sum over all points; on a CPU threads of a block are fibers."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", parts > 1)
+    draws, worlds, starts = np.random.default_rng(5), 11, np.array([0, 6, 31])
+    x, gradient = draws.normal(size=(2, worlds, starts[-1], 3))
+    given = [wp.array(a.reshape(worlds, -1), dtype=wp.float64, device="cpu") for a in (x, gradient)]
+    volume = wp.full((worlds, 3), 7.0, dtype=wp.float64, device="cpu")
+    threads = parts * team.team("cpu", worlds, 2)[1]
+    inputs = [parts, 1, wp.array(starts, dtype=wp.int32, device="cpu"), *given]
+    kernel = cavity.kernels(lanes.variant("cuda", "float64")).share_volume
+    wp.launch(kernel, threads, inputs, [volume], device="cpu", block_dim=32 if parts > 1 else 1)
+    own = [slice(*starts[k : k + 2]) for k in (0, 1)]
+    wanted = [((x[:, s] - x[:, s.start, None]) * gradient[:, s]).sum(axis=(1, 2)) / 3.0 for s in own]
+    np.testing.assert_allclose(volume.numpy(), np.stack([np.full(worlds, 7.0), *wanted], axis=1), rtol=1e-12)

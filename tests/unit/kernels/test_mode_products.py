@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from softwarp.kernels.algebra import lanes
+from softwarp.kernels.algebra import team as sums_of_teams
 from softwarp.kernels.elements import mode_loads, mode_places, reduction, samples, tensor_sums
 
 WORLDS, STRIDES, SAMPLES = 3, (16, 32), (2, 3)  # two bodies
@@ -54,19 +55,22 @@ def test_stiffness_in_modes(size, worlds):
 def test_stiffness_on_tensor_cores(modes, device):
     """E' K E of the second of two bodies with its tets and triangles, as exact as sums of float32; an odd world too."""
     draws, first, count = np.random.default_rng(modes), 5, {samples.TET: 21, samples.TRI: 10}
-    wanted, arrays, stiffness = 0.0, [], []
+    wanted, arrays, stiffness, halves, scales = 0.0, [], [], [], []
     for size, many in count.items():
         E = draws.normal(size=(first + many, size, modes)).astype(np.float32)
         K = draws.normal(size=(WORLDS, first + many, size, size)).astype(np.float32)
         arrays.append(wp.array(E.ravel(), dtype=wp.float32, device=device))
         stiffness.append(wp.array(K.reshape(WORLDS, -1), dtype=wp.float32, device=device))
+        parts = tensor_sums.fragments(E[first:])
+        halves.append(wp.array(parts.halves, dtype=wp.int32, device=device))
+        scales += [parts.most, parts.back]
         own = [a.astype(np.float64) for a in (E[first:], K[:, first:])]
         wanted = wanted + np.einsum("eai,weab,ebj->wij", own[0], own[1], own[0], optimize=True)
     begin = [number for size, many in count.items() for number in (many, first * size * modes, first * size**2)]
     total = wp.full((WORLDS, 7 + modes**2), 7.0, dtype=wp.float32, device=device)
     kernel = tensor_sums.kernels(lanes.variant("cuda", "float32"), modes).stiffness
     dim, block = (-(-WORLDS // tensor_sums.GROUP), tensor_sums.THREADS), tensor_sums.THREADS
-    wp.launch(kernel, dim, [*begin, 7, *arrays, *stiffness], [total], device=device, block_dim=block)
+    wp.launch(kernel, dim, [*begin, 7, *scales, *arrays, *halves, *stiffness], [total], device=device, block_dim=block)
     found = total.numpy()
     low = np.tril_indices(modes)
     error = (found[:, 7:].reshape(wanted.shape) - wanted)[:, *low]
@@ -74,9 +78,44 @@ def test_stiffness_on_tensor_cores(modes, device):
     assert (found[:, :7] == 7.0).all()
 
 
-@pytest.mark.parametrize("worlds", [3, 64])
-def test_forces_on_modes(worlds):
-    """Phi' f of both bodies is added, whatever nodes have no force; also where warps of a block share worlds."""
+@pytest.mark.parametrize("size", [samples.TET, samples.TRI])
+def test_halves_are_the_rows_to_rounding(size):
+    """Heads and tails at the places that tensor cores give them, to 2^-23 of a number or 2^-39 of the largest."""
+    E = np.random.default_rng(size).normal(size=(11, size, 32)).astype(np.float32) * np.float32(28.0)
+    E[3] *= 1e-4
+    parts = tensor_sums.fragments(E)
+    rounds = -(-size // 2)
+    both = parts.halves.view(np.float16).reshape(2, rounds, 2, 2, 32, 4, 2).astype(np.float64)
+    assert np.abs(both).max() <= 2.0**tensor_sums.TOP
+    found, seen = both.sum(axis=3) * parts.back, 0
+    for stage, r, tile, thread, q, row in np.ndindex(found.shape):
+        sample, mode = 8 * stage + thread % 4 + 4 * (q // 2), 16 * tile + thread // 4 + 8 * (q % 2)
+        is_one = sample < len(E) and 2 * r + row < size
+        wanted = E[sample, 2 * r + row, mode] if is_one else 0.0
+        assert abs(found[stage, r, tile, thread, q, row] - wanted) <= max(2.0**-23 * abs(wanted), 2.0**-25 * parts.back)
+        seen += is_one
+    assert seen == E.size and parts.most == np.abs(E).max()
+
+
+@pytest.fixture(params=[(3, 1), (16, 1), (3, sums_of_teams.PARTS)], ids=["alone", "beside", "shared"])
+def team(request, monkeypatch):
+    """Worlds, threads for each of them and some modes, and threads of a block, which run together if they share."""
+    worlds, parts = request.param
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", parts > 1)
+    return worlds, parts, 32 if parts > 1 else 1
+
+
+def load(kernel, team, modes, inputs, output):
+    """Launch a kernel of ``mode_loads`` on a CPU."""
+    worlds, parts, block = team
+    threads = parts * sums_of_teams.team("cpu", worlds, modes // mode_loads.GROUP)[1]
+    wp.launch(kernel, threads, [parts, *inputs], [output], device="cpu", block_dim=block)
+    return output.numpy()
+
+
+def test_forces_on_modes(team):
+    """Phi' f of both bodies is added, whatever nodes have no force; also where threads share nodes."""
+    worlds = team[0]
     draws, variant = np.random.default_rng(1), lanes.variant("cuda", "float64")
     nodes, body = 9, np.array([0, 1, 1, 0, 1, 0, 0, 1, 1])
     stride = np.array(STRIDES)[body]
@@ -92,15 +131,41 @@ def test_forces_on_modes(worlds):
     inputs += [wp.array(f.reshape(worlds, -1), dtype=wp.float64, device="cpu")]
     out = wp.full((worlds, int(wide[-1])), 2.0, dtype=wp.float64, device="cpu")
     kernel = mode_loads.kernels(variant).add_forces
-    found = launch(kernel, (int(wide[-1]) // mode_loads.GROUP, worlds), inputs, out)
+    found = load(kernel, team, int(wide[-1]), inputs, out)
     for number, s in enumerate(STRIDES):
         wanted = 2.0 + sum(f[:, n] @ basis[n] for n in range(nodes) if body[n] == number)
         np.testing.assert_allclose(found[:, wide[number] : wide[number] + s], wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("worlds", [3, 64])
-def test_rows_on_modes(worlds):
+def test_forces_of_contacts_on_modes(team):
+    """Phi' f of the nodes that touch something is added to forces on the dofs of their bodies' modes."""
+    worlds, parts, block = team
+    draws, variant, dofs = np.random.default_rng(6), lanes.variant("cuda", "float64"), 20
+    nodes, blocks = (7, 21), tuple(s // 3 for s in STRIDES)
+    stride, begin = np.repeat(STRIDES, nodes), np.repeat([0, blocks[0]], nodes)
+    basis = [draws.normal(size=(3, s)) for s in stride]
+    f = draws.normal(size=(worlds, sum(nodes), 3)) * (draws.uniform(size=(worlds, sum(nodes), 1)) < 0.5)
+    mode_dof = 1 + draws.permutation(sum(blocks))
+    ranges = np.repeat([[0, nodes[0]], [nodes[0], sum(nodes)]], blocks, axis=0)
+    arrays = [mode_dof, ranges, begin, stride, np.cumsum(3 * stride) - 3 * stride]
+    inputs = [wp.array(a, dtype=wp.int32, device="cpu") for a in arrays]
+    inputs.append(wp.array(np.concatenate([b.ravel() for b in basis]), dtype=wp.float64, device="cpu"))
+    forces = np.concatenate([np.full((worlds, 3 * dofs), np.nan), f.reshape(worlds, -1)], axis=1)
+    inputs.append(wp.array(forces, dtype=wp.float64, device="cpu"))
+    out = wp.full((worlds, 3 * dofs), 2.0, dtype=wp.float64, device="cpu")
+    threads = parts * sums_of_teams.team("cpu", worlds, sum(blocks))[1]
+    kernel = mode_loads.kernels(variant).touch_forces
+    wp.launch(kernel, threads, [parts, dofs, *inputs], [out], device="cpu", block_dim=block)
+    wanted = np.full((worlds, dofs, 3), 2.0)
+    for k, dof in enumerate(mode_dof):
+        at = 3 * (k - (k >= blocks[0]) * blocks[0])
+        wanted[:, dof] += sum(f[:, n] @ basis[n][:, at : at + 3] for n in range(*ranges[k]))
+    np.testing.assert_allclose(out.numpy(), wanted.reshape(worlds, -1), rtol=1e-12)
+
+
+def test_rows_on_modes(team):
     """Rows of H on the modes of their bodies, from gradients by their points."""
+    worlds = team[0]
     draws, variant = np.random.default_rng(3), lanes.variant("cuda", "float64")
     points, body = np.array([4, 7, 5]), np.array([0, 1, 1])
     stride = np.array(STRIDES)[body]
@@ -113,7 +178,7 @@ def test_rows_on_modes(worlds):
     inputs += [wp.array(gradient, dtype=wp.float64, device="cpu")]
     out = wp.zeros((worlds, int(stride.sum())), dtype=wp.float64, device="cpu")
     kernel = mode_loads.kernels(variant).mode_rows
-    found = launch(kernel, (int(stride.sum()) // mode_loads.GROUP, worlds), inputs, out)
+    found = load(kernel, team, int(stride.sum()), inputs, out)
     for row, b in enumerate(basis):
         own = gradient[:, 3 * arrays[1][row] :][:, : 3 * points[row]]
         np.testing.assert_allclose(found[:, wide[row] : wide[row] + stride[row]], own @ b, rtol=1e-12, atol=1e-12)
