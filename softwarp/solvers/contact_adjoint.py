@@ -62,7 +62,9 @@ class ContactAdjoint:
     """
 
     forward = False  # whether the equations are those of changes of forces
+    drops_open = True  # whether what pushed in no solution is left out; nobody else may know contacts by their place
     knows_way = False  # whether ``way`` has been found from another p
+    first_force: Rows | None = None  # of contacts in the first solution, where that is differentiated too
     later: Rows | None = None  # what ``push_nodes`` adds by v: of later contacts, which look where it leads to
 
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
@@ -118,10 +120,21 @@ class ContactAdjoint:
         self._expand(v)
         self.z.zero()
         if first:
+            if self.drops_open:
+                self._drop_open()
             c.first.zero()
             self.laws.sides(self.system.linear)
         inputs = [self.h, c.count.real, *self._rows(), c.mu.real, c.multiplier.real, v.real]
         s.each_real(self.k.modes, c.capacity, inputs, [self.mode.real])
+
+    def _drop_open(self) -> None:
+        """Leave out contacts that pushed in no solution, which have no part in anything."""
+        c, d, s = self.contacts, self.detector, self.shard
+        first_force = c.multiplier if self.first_force is None else self.first_force
+        outputs = [c.count.real, c.listed.real, c.key.real, c.pair.real, c.dof.real, d.couple.real, d.face.real]
+        outputs += [self.look.real, c.weight.real, c.lever.real, c.axes.real, c.gap.real, c.mu.real]
+        outputs += [c.restitution.real, c.compliance.real, c.multiplier.real, first_force.real, self.normal.real]
+        s.each_real(self.k.drop_open, None, [9 if self.normal is c.axes else 3], outputs)
 
     def add_forces(self, y: Rows) -> None:
         """y -= h H' z."""

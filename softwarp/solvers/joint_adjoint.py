@@ -100,7 +100,7 @@ class JointAdjoint(JointSides):
         held = [self.u, self.force, self.differences]
         if self.contact is not None:
             self.contact_force = [s.rows(3 * self.contact.contacts.capacity) for _ in range(1 + self.last)]
-            self.contact.knows_way = True
+            self.contact.knows_way, self.contact.drops_open = True, False
             held.append(self.contact_force)
         self.solution = [part.real for parts in held for part in parts]
         owner.system.watch = self.keep

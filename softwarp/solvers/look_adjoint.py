@@ -120,6 +120,7 @@ class Looking(StepAdjoint):
         turns = self.modes is not None and self.modes.frames is not None
         self.later = s.rows(3 * self.model.dof_room) if turns else None  # on nodes, which turn
         self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
+        self.contact.first_force = self.first.force
         g = gradients
         self.before = None if self.modes is None else wp.zeros_like(g.node_v)  # what of late contacts goes to modes
         self.comes_first = False  # whether the first solution is differentiated

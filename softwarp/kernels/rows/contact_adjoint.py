@@ -154,6 +154,88 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         mode_out[pack, 4 * contact + 3, lane] = r[2]
 
     @wp.func
+    def shift(array: wp.array3d(dtype=real), pack: int, lane: int, start: int, end: int, width: int):
+        """Copy the rows of one contact to those of another."""
+        for row in range(width):
+            array[pack, width * end + row, lane] = array[pack, width * start + row, lane]
+
+    @wp.func
+    def shift_integers(array: wp.array3d(dtype=wp.int32), pack: int, lane: int, start: int, end: int, width: int):
+        """The same of integers."""
+        for row in range(width):
+            array[pack, width * end + row, lane] = array[pack, width * start + row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def drop_open(
+        normal_rows: int,
+        # Workspace out
+        count_out: wp.array3d(dtype=wp.int32),
+        listed_out: wp.array3d(dtype=wp.int32),
+        key_out: wp.array3d(dtype=wp.int32),
+        pair_out: wp.array3d(dtype=wp.int32),
+        dof_out: wp.array3d(dtype=wp.int32),
+        couple_out: wp.array3d(dtype=wp.int32),
+        face_out: wp.array3d(dtype=wp.int32),
+        look_out: wp.array3d(dtype=wp.int32),
+        weight_out: wp.array3d(dtype=real),
+        lever_out: wp.array3d(dtype=real),
+        axes_out: wp.array3d(dtype=real),
+        gap_out: wp.array3d(dtype=real),
+        mu_out: wp.array3d(dtype=real),
+        restitution_out: wp.array3d(dtype=real),
+        softness_out: wp.array3d(dtype=real),
+        multiplier_out: wp.array3d(dtype=real),
+        first_force_out: wp.array3d(dtype=real),
+        normal_out: wp.array3d(dtype=real),
+    ):
+        """Leave out the contacts of one world that pushed in no solution, as nothing has a gradient by them.
+
+        Others keep their order; places that become free are neutral. Arrays may be the same.
+        """
+        pack, lane = wp.tid()
+        kept = int(0)
+        listed = int(0)
+        count = count_out[pack, 0, lane]
+        for contact in range(count):
+            pushes = multiplier_out[pack, 3 * contact, lane] > real(0.0)
+            if pushes or first_force_out[pack, 3 * contact, lane] > real(0.0):
+                if kept < contact:
+                    shift_integers(key_out, pack, lane, contact, kept, 1)
+                    shift_integers(pair_out, pack, lane, contact, kept, 1)
+                    shift_integers(dof_out, pack, lane, contact, kept, wp.static(SLOTS))
+                    shift_integers(couple_out, pack, lane, contact, kept, 1)
+                    shift_integers(face_out, pack, lane, contact, kept, 1)
+                    shift_integers(look_out, pack, lane, contact, kept, 1)
+                    shift(weight_out, pack, lane, contact, kept, wp.static(SLOTS))
+                    shift(lever_out, pack, lane, contact, kept, wp.static(3 * SLOTS))
+                    shift(axes_out, pack, lane, contact, kept, 9)
+                    shift(gap_out, pack, lane, contact, kept, 1)
+                    shift(mu_out, pack, lane, contact, kept, 1)
+                    shift(restitution_out, pack, lane, contact, kept, 1)
+                    shift(softness_out, pack, lane, contact, kept, 1)
+                    shift(multiplier_out, pack, lane, contact, kept, 3)
+                    shift(first_force_out, pack, lane, contact, kept, 3)
+                    shift(normal_out, pack, lane, contact, kept, normal_rows)
+                kept += 1
+                if contact < listed_out[pack, 0, lane]:
+                    listed += 1
+        for contact in range(kept, count):
+            gap_out[pack, contact, lane] = real(1.0)
+            mu_out[pack, contact, lane] = real(0.0)
+            for row in range(wp.static(SLOTS)):
+                dof_out[pack, wp.static(SLOTS) * contact + row, lane] = -1
+                weight_out[pack, wp.static(SLOTS) * contact + row, lane] = real(0.0)
+            for row in range(wp.static(3 * SLOTS)):
+                lever_out[pack, wp.static(3 * SLOTS) * contact + row, lane] = real(0.0)
+            for row in range(9):
+                axes_out[pack, 9 * contact + row, lane] = real(0.0)
+            for row in range(3):
+                multiplier_out[pack, 3 * contact + row, lane] = real(0.0)
+                first_force_out[pack, 3 * contact + row, lane] = real(0.0)
+        count_out[pack, 0, lane] = kept
+        listed_out[pack, 0, lane] = listed
+
+    @wp.func
     def equation(
         delassus: wp.array3d(dtype=real),
         compliance: wp.array3d(dtype=real),
@@ -382,7 +464,7 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         for i in range(total, order):
             change_out[pack, i, lane] = real(0.0)
 
-    result = SimpleNamespace(known_gaps=known_gaps, modes=modes, solve=solve)
+    result = SimpleNamespace(known_gaps=known_gaps, modes=modes, drop_open=drop_open, solve=solve)
     if variant.world_fastest:
         return result
     factor, eliminate = elimination.functions(real).factor, elimination.functions(real).solve
