@@ -84,7 +84,8 @@ class ContactAdjoint:
         if s.variant.world_fastest:
             self.matrix = rows.allocate_whole(s.variant, s.world_count, order**2, s.device).real
         else:
-            self.matrix = memory.zeros((worlds, order**2, 1), s.variant.real, s.device)
+            size = order * elimination.stride_of(order)
+            self.matrix = memory.zeros((worlds, size, 1), s.variant.real, s.device)
             self.held = memory.zeros((worlds, elimination.ROWS * order, 1), s.variant.real, s.device)
         self.is_new = True  # so that factors of the equations are to be found
 
@@ -180,7 +181,12 @@ class ContactAdjoint:
         if s.variant.world_fastest:
             s.each_real(self.k.solve, None, [*sizes, *inputs], [self.matrix, *outputs])
         else:
-            s.each_real(self.k.solve_again, None, [*sizes, self.is_new, *inputs], [self.matrix, self.held, *outputs])
+            if self.is_new:
+                s.each_real(self.k.note_equations, None, [*sizes, *inputs, self.z.real], [self.held])
+                of_packs = [*sizes, c.count.real, laws.matrix.real, self.held]
+                wp.launch(self.k.fill_matrices, s.packs, of_packs, [self.matrix], device=s.device)
+                s.each_real(self.k.factor_matrix, None, [*sizes, c.count.real], [self.matrix, self.held])
+            s.each_real(self.k.solve_again, None, [*sizes, *inputs, self.matrix], [self.held, *outputs])
         self.is_new = False
         laws.add_change(y, -h)
 

@@ -236,8 +236,7 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         listed_out[pack, 0, lane] = listed
 
     @wp.func
-    def equation(
-        delassus: wp.array3d(dtype=real),
+    def terms(
         compliance: wp.array3d(dtype=real),
         softness: wp.array3d(dtype=real),
         active: wp.array3d(dtype=wp.int32),
@@ -245,31 +244,23 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         mu: wp.array3d(dtype=real),
         gap: wp.array3d(dtype=real),
         offset: wp.array3d(dtype=real),
-        q: wp.array3d(dtype=real),
         z: wp.array3d(dtype=real),
         pack: int,
         lane: int,
         rows: int,
-        order: int,
-        total: int,
         i: int,
-        is_new: bool,
-        at: int,
-        place: int,
-        matrix_out: wp.array3d(dtype=real),
-        change_out: wp.array3d(dtype=real),
     ):
-        """One row of the equations for the change of q and z: coefficients, and the right-hand side in ``change``.
+        """One equation for the change of q and z: the right-hand side, and what its coefficients are made of.
 
-        The matrix is that at ``at`` and ``place``, and stays as it is unless it ``is_new``.
+        These are factors of its own row of W, of the two tangents' rows and of the unit matrix, and of friction what
+        pressure adds.
         """
-        own = real(1.0)  # factors of this row of W, of the two tangents' rows, and of the unit matrix
+        own = real(1.0)
         first = real(0.0)
         second = real(0.0)
         unit = real(0.0)
+        pressed = real(0.0)
         before = real(0.0)
-        pressed = real(0.0)  # share of the pressure in friction
-        normal = int(-1)
         is_open = bool(False)
         t = i
         if i < rows:
@@ -294,7 +285,6 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 unit = real(1.0)
                 before = z[pack, 3 * contact + axis, lane]
                 if wp.static(forward):
-                    normal = t - 1
                     pressed = -mu[pack, contact, lane] * wp.where(axis == 1, r1, r2)
                     before += pressed * z[pack, 3 * contact, lane] + offset[pack, 3 * contact + axis, lane]
                 own = real(0.0)
@@ -304,24 +294,48 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 else:
                     first = -k * r1 * r2
                     second = k * (real(1.0) - r2 * r2)
-        u = wp.min(t + 1, total - 1)
         right = own * gap[pack, i, lane] - before
         if first != real(0.0) or second != real(0.0):
-            right += first * gap[pack, t, lane] + second * gap[pack, u, lane]
-        change_out[pack, i, lane] = wp.where(is_open, real(0.0), right)
-        if not is_new:
-            return
+            right += first * gap[pack, t, lane] + second * gap[pack, t + 1, lane]
+        if is_open:
+            right = real(0.0)
+            own = real(0.0)
+            first = real(0.0)
+            second = real(0.0)
+            unit = real(1.0)
+            pressed = real(0.0)
+        return right, own, first, second, unit, pressed
+
+    @wp.func
+    def fill_row(
+        delassus: wp.array3d(dtype=real),
+        pack: int,
+        lane: int,
+        rows: int,
+        order: int,
+        total: int,
+        i: int,
+        own: real,
+        first: real,
+        second: real,
+        unit: real,
+        pressed: real,
+        matrix_out: wp.array3d(dtype=real),
+    ):
+        """Coefficients of one equation, from ``terms``."""
+        t = i
+        if i >= rows:
+            t = i - (i - rows) % 3 + 1
         for j in range(total):
             entry = own * delassus[pack, i * order + j, lane]
             if first != real(0.0) or second != real(0.0):
-                entry += first * delassus[pack, t * order + j, lane] + second * delassus[pack, u * order + j, lane]
+                entry += first * delassus[pack, t * order + j, lane]
+                entry += second * delassus[pack, (t + 1) * order + j, lane]
             if i == j:
                 entry += unit
-            if j == normal:
+            if i >= rows and j == t - 1:
                 entry += pressed
-            if is_open:
-                entry = wp.where(i == j, real(1.0), real(0.0))
-            matrix_out[at, i * order + j, place] = entry
+            matrix_out[pack, i * order + j, lane] = entry
 
     @wp.func
     def swap(
@@ -379,8 +393,7 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         pack, lane = wp.tid()
         total = rows + 3 * count_in[pack, 0, lane]
         for i in range(total):
-            equation(
-                delassus_in,
+            right, own, first, second, unit, pressed = terms(
                 compliance_in,
                 softness_in,
                 active_in,
@@ -388,19 +401,27 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 mu_in,
                 gap_in,
                 offset_in,
-                q_out,
                 z_out,
+                pack,
+                lane,
+                rows,
+                i,
+            )
+            change_out[pack, i, lane] = right
+            fill_row(
+                delassus_in,
                 pack,
                 lane,
                 rows,
                 order,
                 total,
                 i,
-                True,
-                pack,
-                lane,
+                own,
+                first,
+                second,
+                unit,
+                pressed,
                 matrix_out,
-                change_out,
             )
         scale = real(0.0)
         for i in range(total):
@@ -450,7 +471,8 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
             if matrix_out[pack, i * order + i, lane] != real(0.0):
                 rank -= 1
                 value = change_out[pack, rank, lane]
-                for j in range(i + 1, total):
+                for later in range(total - 1 - i):  # from the last one, as ``elimination`` has it
+                    j = total - 1 - later
                     value -= matrix_out[pack, rank * order + j, lane] * change_out[pack, j, lane]
                 value = value / matrix_out[pack, rank * order + i, lane]
             change_out[pack, i, lane] = value
@@ -467,13 +489,13 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
     result = SimpleNamespace(known_gaps=known_gaps, modes=modes, drop_open=drop_open, solve=solve)
     if variant.world_fastest:
         return result
-    factor, eliminate = elimination.functions(real).factor, elimination.functions(real).solve
+    of_world = elimination.functions(real)
+    fill, factor, eliminate = of_world.fill, of_world.factor, of_world.solve
 
     @wp.kernel(module=module, enable_backward=False)
-    def solve_again(
+    def note_equations(
         rows: int,
         order: int,
-        is_new: bool,
         # Workspace in
         count_in: wp.array3d(dtype=wp.int32),
         delassus_in: wp.array3d(dtype=real),
@@ -484,21 +506,15 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         mu_in: wp.array3d(dtype=real),
         gap_in: wp.array3d(dtype=real),
         offset_in: wp.array3d(dtype=real),
+        z_in: wp.array3d(dtype=real),
         # Workspace out
-        matrix_out: wp.array3d(dtype=real),
         held_out: wp.array3d(dtype=real),
-        change_out: wp.array3d(dtype=real),
-        q_out: wp.array3d(dtype=real),
-        z_out: wp.array3d(dtype=real),
-        unsure_out: wp.array3d(dtype=wp.int32),
     ):
-        """``solve`` on a CPU, where factors of a matrix that is not new serve again."""
+        """What the equations of one world are made of; the first step of ``solve`` on a CPU."""
         pack, lane = wp.tid()
         world = pack * gap_in.shape[2] + lane
-        total = rows + 3 * count_in[pack, 0, lane]
-        for i in range(total):
-            equation(
-                delassus_in,
+        for i in range(rows + 3 * count_in[pack, 0, lane]):
+            _right, own, first, second, unit, pressed = terms(
                 compliance_in,
                 softness_in,
                 active_in,
@@ -506,40 +522,106 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
                 mu_in,
                 gap_in,
                 offset_in,
-                q_out,
+                z_in,
+                pack,
+                lane,
+                rows,
+                i,
+            )
+            held_out[world, wp.static(elimination.UNIT) * order + i, 0] = unit_of(delassus_in, pack, lane, order, i)
+            held_out[world, wp.static(elimination.OWN) * order + i, 0] = own
+            held_out[world, wp.static(elimination.FIRST) * order + i, 0] = first
+            held_out[world, wp.static(elimination.SECOND) * order + i, 0] = second
+            held_out[world, wp.static(elimination.DIAGONAL) * order + i, 0] = unit
+            held_out[world, wp.static(elimination.PRESSED) * order + i, 0] = pressed
+
+    @wp.kernel(module=module, enable_backward=False)
+    def fill_matrices(
+        rows: int,
+        order: int,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        delassus_in: wp.array3d(dtype=real),
+        held_in: wp.array3d(dtype=real),
+        # Workspace out
+        matrix_out: wp.array3d(dtype=real),
+    ):
+        """Equations of all worlds of a pack, whose numbers of W stand side by side."""
+        pack = wp.tid()
+        fill(delassus_in, count_in, held_in, pack, rows, order, matrix_out)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def factor_matrix(
+        rows: int,
+        order: int,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        matrix_out: wp.array3d(dtype=real),
+        held_out: wp.array3d(dtype=real),
+    ):
+        """Factors of one world's equations."""
+        pack, lane = wp.tid()
+        world = pack * count_in.shape[2] + lane
+        total = rows + 3 * count_in[pack, 0, lane]
+        factor(matrix_out, held_out, world, order, total, real(wp.static(dependent)))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def solve_again(
+        rows: int,
+        order: int,
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        delassus_in: wp.array3d(dtype=real),
+        compliance_in: wp.array3d(dtype=real),
+        softness_in: wp.array3d(dtype=real),
+        active_in: wp.array3d(dtype=wp.int32),
+        mode_in: wp.array3d(dtype=real),
+        mu_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
+        offset_in: wp.array3d(dtype=real),
+        matrix_in: wp.array3d(dtype=real),
+        # Workspace out
+        held_out: wp.array3d(dtype=real),
+        change_out: wp.array3d(dtype=real),
+        q_out: wp.array3d(dtype=real),
+        z_out: wp.array3d(dtype=real),
+        unsure_out: wp.array3d(dtype=wp.int32),
+    ):
+        """The last step of ``solve`` on a CPU, for which factors serve as long as nothing else changes."""
+        pack, lane = wp.tid()
+        world = pack * gap_in.shape[2] + lane
+        total = rows + 3 * count_in[pack, 0, lane]
+        scale = real(0.0)
+        for i in range(total):
+            right, _own, _first, _second, _unit, _pressed = terms(
+                compliance_in,
+                softness_in,
+                active_in,
+                mode_in,
+                mu_in,
+                gap_in,
+                offset_in,
                 z_out,
                 pack,
                 lane,
                 rows,
-                order,
-                total,
                 i,
-                is_new,
-                world,
-                0,
-                matrix_out,
-                change_out,
             )
-            if is_new:
-                held_out[world, i, 0] = unit_of(delassus_in, pack, lane, order, i)
-        if is_new:
-            factor(matrix_out, held_out, world, order, total, real(wp.static(dependent)))
-        scale = real(0.0)
-        for i in range(total):
             known = real(0.0)
             if i >= rows:
                 known = delassus_in[pack, i * order + i, lane] * z_out[pack, i - rows, lane]
-            right = change_out[pack, i, lane]
-            largest = held_out[world, order + i, 0]
+            largest = held_out[world, wp.static(elimination.LARGEST) * order + i, 0]
             if largest > real(0.0):
                 right = right / largest
                 known = known / largest
-            held_out[world, 2 * order + i, 0] = right
+            held_out[world, wp.static(elimination.RIGHT) * order + i, 0] = right
             scale = wp.max(scale, wp.max(wp.abs(right), wp.abs(known)))
-        if eliminate(matrix_out, held_out, world, order, total, real(wp.static(unsolved)) * scale) != 0:
+        if eliminate(matrix_in, held_out, world, order, total, real(wp.static(unsolved)) * scale) != 0:
             unsure_out[pack, 0, lane] = 1
         for i in range(total):
-            value = held_out[world, 2 * order + i, 0] * held_out[world, i, 0]
+            value = held_out[world, wp.static(elimination.RIGHT) * order + i, 0]
+            value = value * held_out[world, wp.static(elimination.UNIT) * order + i, 0]
             change_out[pack, i, lane] = value
             if i < rows:
                 q_out[pack, i, lane] = q_out[pack, i, lane] + value
@@ -548,4 +630,10 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         for i in range(total, order):
             change_out[pack, i, lane] = real(0.0)
 
-    return SimpleNamespace(**vars(result), solve_again=solve_again)
+    on_cpu = {
+        "note_equations": note_equations,
+        "fill_matrices": fill_matrices,
+        "factor_matrix": factor_matrix,
+        "solve_again": solve_again,
+    }
+    return SimpleNamespace(**vars(result), **on_cpu)
