@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softwarp.kernels.rows import contact_adjoint, elimination, embedded_adjoint, touch_adjoint, touch_gather
+from softwarp.kernels.rows import (
+    contact_adjoint,
+    contact_equations,
+    elimination,
+    embedded_adjoint,
+    touch_adjoint,
+    touch_gather,
+)
 from softwarp.model import memory
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.collision.detector import Detector
@@ -74,19 +81,18 @@ class ContactAdjoint:
         self.laws, self.contacts, self.shard = system.multipliers.laws, system.contact.contacts, system.shard
         self.pairs, self.subspace = system.contact.pairs, system.contact.subspace
         s = self.shard
-        self.k = contact_adjoint.kernels(s.variant, self.forward)
+        self.k, self.k_laws = contact_adjoint.kernels(s.variant), contact_equations.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
         self.spare, self.offset, self.way, self.force = (s.rows(3 * self.contacts.capacity) for _ in range(4))
         self.detector = system.contact.detector
         self.unsure = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self._prepare_touches()
         order, worlds = self.laws.order, s.packs * s.lanes
+        sizes = order * elimination.stride_of(order), order * elimination.ROWS
         if s.variant.world_fastest:
-            self.matrix = rows.allocate_whole(s.variant, s.world_count, order**2, s.device).real
+            self.matrix, self.held = (rows.allocate_whole(s.variant, s.world_count, n, s.device).real for n in sizes)
         else:
-            size = order * elimination.stride_of(order)
-            self.matrix = memory.zeros((worlds, size, 1), s.variant.real, s.device)
-            self.held = memory.zeros((worlds, elimination.ROWS * order, 1), s.variant.real, s.device)
+            self.matrix, self.held = (memory.zeros((worlds, n, 1), s.variant.real, s.device) for n in sizes)
         self.is_new = True  # so that factors of the equations are to be found
 
     def _prepare_touches(self) -> None:
@@ -167,7 +173,7 @@ class ContactAdjoint:
             active: Which static rows are between their bounds.
             first: Whether the factor is a new one.
         """
-        laws, c, s, h, w = self.laws, self.contacts, self.shard, self.h, self.shard.work
+        laws, c, s, h, w, k = self.laws, self.contacts, self.shard, self.h, self.shard.work, self.k_laws
         if first:
             self.is_new = True
             laws.delassus(y, h * h, whole=True)
@@ -178,15 +184,14 @@ class ContactAdjoint:
         inputs = [c.count.real, laws.matrix.real, w.compliance.real, c.compliance.real]
         inputs += [active.real, self.mode.real, c.mu.real, laws.gap.real, self.offset.real]
         outputs, sizes = [laws.change.real, q.real, self.z.real, self.unsure], [laws.static_rows, laws.order]
-        if s.variant.world_fastest:
-            s.each_real(self.k.solve, None, [*sizes, *inputs], [self.matrix, *outputs])
-        else:
-            if self.is_new:
-                s.each_real(self.k.note_equations, None, [*sizes, *inputs, self.z.real], [self.held])
-                of_packs = [*sizes, c.count.real, laws.matrix.real, self.held]
-                wp.launch(self.k.fill_matrices, s.packs, of_packs, [self.matrix], device=s.device)
-                s.each_real(self.k.factor_matrix, None, [*sizes, c.count.real], [self.matrix, self.held])
-            s.each_real(self.k.solve_again, None, [*sizes, *inputs, self.matrix], [self.held, *outputs])
+        if self.is_new:
+            s.each_real(k.note_equations, None, [*sizes, *inputs, self.z.real], [self.held])
+            of_worlds, items = [*sizes, c.count.real, laws.matrix.real, self.held], 1
+            if s.variant.world_fastest:
+                items = laws.order
+            wp.launch(k.fill_matrices, s.variant.dim(s.width, items), of_worlds, [self.matrix], device=s.device)
+            s.each_real(k.factor_matrix, None, [*sizes, c.count.real], [self.matrix, self.held])
+        s.each_real(k.solve_again, None, [*sizes, *inputs, self.matrix], [self.held, *outputs])
         self.is_new = False
         laws.add_change(y, -h)
 

@@ -1,10 +1,11 @@
-"""Gauss' elimination of the equations of one world's contacts on a CPU, whose factors serve again.
+"""Gauss' elimination of the equations of one world's contacts, whose factors serve again.
 
-A world's matrix lies in one piece, (world, row * stride + column, 1), so that rows are subtracted in whole registers,
-those of eight pivots at once while a number is in one. Behind it, in ``held``, are numbers of every row, ``ROWS`` of
-them: its unknown's unit, its largest entry, the right-hand side, the place of the column's pivot or -1, the row that
-was exchanged for it, the column of the row's pivot, and what makes the row of the matrix from those of W. Products are
-not fused with sums: results are to the bit those of one number after the other.
+On a CPU a world's matrix lies in one piece, (world, row * stride + column, 1), so that rows are subtracted in whole
+registers, those of eight pivots at once while a number is in one; on a GPU worlds lie side by side, (1, row, world).
+Behind it, in ``held``, are numbers of every row, ``ROWS`` of them: its unknown's unit, its largest entry, the
+right-hand side, the place of the column's pivot or -1, the row that was exchanged for it, the column of the row's
+pivot, and what makes the row of the matrix from those of W. On a CPU products are not fused with sums: results are to
+the bit those of one number after the other.
 """
 
 from functools import cache
@@ -13,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.algebra.lanes import LANE_COUNT
+from softwarp.kernels.algebra.lanes import LANE_COUNT, Variant
 
 UNIT, LARGEST, RIGHT, PLACE, OTHER, COLUMN, OWN, FIRST, SECOND, DIAGONAL, PRESSED, ROWS = range(12)
 PADDING = 16  # numbers behind a row, which registers may reach into
@@ -206,19 +207,24 @@ return contradicts;
 
 
 @cache
-def functions(real: Any) -> SimpleNamespace:
-    """``fill``, ``factor`` and ``solve`` in one precision."""
+def functions(variant: Variant) -> SimpleNamespace:
+    """``write_equations``, ``factor`` and ``solve`` of one variant, of single worlds."""
+    return _of_threads(variant.real) if variant.world_fastest else _in_registers(variant.real)
+
+
+def _in_registers(real: Any) -> SimpleNamespace:
     name = "double" if real is wp.float64 else "float"
 
     def source(text: str) -> str:
         return text.replace("REAL", name).replace("PADDING", str(PADDING)).replace("LANES", str(LANE_COUNT))
 
     @wp.func_native(source(_FILL))
-    def fill(
+    def write_equations(
         delassus: wp.array3d(dtype=real),
         contacts: wp.array3d(dtype=wp.int32),
         held: wp.array3d(dtype=real),
         pack: int,
+        item: int,
         rows: int,
         order: int,
         matrix: wp.array3d(dtype=real),
@@ -230,6 +236,7 @@ def functions(real: Any) -> SimpleNamespace:
         matrix: wp.array3d(dtype=real),
         held: wp.array3d(dtype=real),
         world: int,
+        lane: int,
         order: int,
         total: int,
         least: real,
@@ -241,10 +248,140 @@ def functions(real: Any) -> SimpleNamespace:
         matrix: wp.array3d(dtype=real),
         held: wp.array3d(dtype=real),
         world: int,
+        lane: int,
         order: int,
         total: int,
         bound: real,
     ) -> int:
         """Solve for the right-hand side in ``held``; whether what has no pivot contradicts by more than a bound."""
 
-    return SimpleNamespace(fill=fill, factor=factor, solve=solve)
+    return SimpleNamespace(write_equations=write_equations, factor=factor, solve=solve)
+
+
+def _of_threads(real: Any) -> SimpleNamespace:
+    """The same for a GPU, one thread a world; ``write_equations`` has one for each row."""
+
+    @wp.func
+    def write_equations(
+        delassus: wp.array3d(dtype=real),
+        contacts: wp.array3d(dtype=wp.int32),
+        held: wp.array3d(dtype=real),
+        w: int,
+        item: int,
+        rows: int,
+        order: int,
+        matrix: wp.array3d(dtype=real),
+    ):
+        total = rows + 3 * contacts[0, 0, w]
+        if item < total:
+            t = item
+            if item >= rows:
+                t = item - (item - rows) % 3 + 1
+            own = held[0, wp.static(OWN) * order + item, w]
+            first = held[0, wp.static(FIRST) * order + item, w]
+            second = held[0, wp.static(SECOND) * order + item, w]
+            for j in range(total):
+                entry = own * delassus[0, item * order + j, w]
+                if first != real(0.0) or second != real(0.0):
+                    entry += first * delassus[0, t * order + j, w]
+                    entry += second * delassus[0, (t + 1) * order + j, w]
+                if item == j:
+                    entry += held[0, wp.static(DIAGONAL) * order + item, w]
+                if item >= rows and j == t - 1:
+                    entry += held[0, wp.static(PRESSED) * order + item, w]
+                entry *= held[0, wp.static(UNIT) * order + j, w]
+                matrix[0, item * wp.static(PADDING) + item * order + j, w] = entry
+
+    @wp.func
+    def factor(
+        matrix: wp.array3d(dtype=real),
+        held: wp.array3d(dtype=real),
+        w: int,
+        lane: int,
+        order: int,
+        total: int,
+        least: real,
+    ):
+        stride = order + wp.static(PADDING)
+        for i in range(total):
+            largest = real(0.0)
+            for j in range(total):
+                largest = wp.max(largest, wp.abs(matrix[w, i * stride + j, lane]))
+            held[w, wp.static(LARGEST) * order + i, lane] = largest
+            if largest > real(0.0):
+                for j in range(total):
+                    matrix[w, i * stride + j, lane] = matrix[w, i * stride + j, lane] / largest
+        rank = int(0)
+        for k in range(total):
+            best = int(rank)
+            top = real(0.0)
+            for i in range(rank, total):
+                here = wp.abs(matrix[w, i * stride + k, lane])
+                if here > top:
+                    top = here
+                    best = i
+            held[w, wp.static(PLACE) * order + k, lane] = real(-1.0)
+            if top > least:
+                pivot = matrix[w, best * stride + k, lane]
+                held[w, wp.static(PLACE) * order + k, lane] = real(rank)
+                held[w, wp.static(OTHER) * order + rank, lane] = real(best)
+                held[w, wp.static(COLUMN) * order + rank, lane] = real(k)
+                if best != rank:
+                    for j in range(total):
+                        kept = matrix[w, rank * stride + j, lane]
+                        matrix[w, rank * stride + j, lane] = matrix[w, best * stride + j, lane]
+                        matrix[w, best * stride + j, lane] = kept
+                for i in range(rank + 1, total):
+                    share = matrix[w, i * stride + k, lane] / pivot
+                    matrix[w, i * stride + k, lane] = share
+                    if share != real(0.0):
+                        for j in range(k + 1, total):
+                            of_pivot = share * matrix[w, rank * stride + j, lane]
+                            matrix[w, i * stride + j, lane] = matrix[w, i * stride + j, lane] - of_pivot
+                rank += 1
+
+    @wp.func
+    def solve(
+        matrix: wp.array3d(dtype=real),
+        held: wp.array3d(dtype=real),
+        w: int,
+        lane: int,
+        order: int,
+        total: int,
+        bound: real,
+    ):
+        stride = order + wp.static(PADDING)
+        y = wp.static(RIGHT) * order
+        rank = int(0)
+        for k in range(total):
+            if held[w, wp.static(PLACE) * order + k, lane] >= real(0.0):
+                best = int(held[w, wp.static(OTHER) * order + rank, lane])
+                value = held[w, y + best, lane]
+                held[w, y + best, lane] = held[w, y + rank, lane]
+                for i in range(rank):
+                    column = int(held[w, wp.static(COLUMN) * order + i, lane])
+                    value -= matrix[w, rank * stride + column, lane] * held[w, y + i, lane]
+                held[w, y + rank, lane] = value
+                rank += 1
+        contradicts = int(0)
+        for i in range(rank, total):  # 0 = 0, or there is no solution
+            value = held[w, y + i, lane]
+            for r in range(rank):
+                column = int(held[w, wp.static(COLUMN) * order + r, lane])
+                value -= matrix[w, i * stride + column, lane] * held[w, y + r, lane]
+            if wp.abs(value) > bound:
+                contradicts = 1
+        for back in range(total):
+            i = total - 1 - back
+            at = int(held[w, wp.static(PLACE) * order + i, lane])
+            value = real(0.0)
+            if at >= 0:
+                value = held[w, y + at, lane]
+                for later in range(back):
+                    j = total - 1 - later
+                    value -= matrix[w, at * stride + j, lane] * held[w, y + j, lane]
+                value = value / matrix[w, at * stride + i, lane]
+            held[w, y + i, lane] = value
+        return contradicts
+
+    return SimpleNamespace(write_equations=write_equations, factor=factor, solve=solve)
