@@ -127,7 +127,11 @@ class StepAdjoint:
         self.contact = None if system.contact is None else self.touches(system, h, gradients)
         self.has_modes_alone = self.modes is not None and m.own_node_count == 0 and self.frames is None
         if self.modes is not None:
-            self.modes.is_lone = self.has_modes_alone and self.contact is None
+            self.modes.is_lone = self.has_modes_alone and self.contact is None and not self.predicts
+            self.modes.has_sums = self.modes.is_lone
+            if self.has_modes_alone and self.contact is not None and not leans:
+                self.modes.has_sums = True
+                self.contact.take_listed(self.modes.model.node, self.modes.listed, self.modes.listed_v)
         self.by_forces = True
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
@@ -494,7 +498,7 @@ class StepAdjoint:
     def _to_state(self) -> None:
         """Gradients by positions, velocities and forces of nodes."""
         s, m, i, g, x = self.shard, self.model, self.shard.input, self.gradients, self.index
-        if self.modes is not None and self.modes.is_lone:
+        if self.modes is not None and self.modes.has_sums:
             self._to_modes(self.modes)
             return
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
@@ -505,10 +509,7 @@ class StepAdjoint:
         s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
         if self.modes is not None:
             self.modes.to_state()
-            if self.modes.frames is not None:
-                if self.contact is not None:
-                    self.contact.push_nodes(self.modes.frames.touch_p, self.modes.frames.touch_v)
-                self.modes.frames.to_state(self.index, self.p, self.modes.wide_p, self.q, self.corner)
+            self._to_floating(self.modes)
         self._to_tractions()
 
     def _to_modes(self, modes: ModeAdjoint) -> None:
@@ -522,7 +523,13 @@ class StepAdjoint:
             inputs = [self.h, s.lanes, self.node_p.real]
             s.each_real(self.k.node_forces, parts, inputs, [self.gradients.command_node_force])
             self._to_tractions()
+        self._to_floating(modes)
+
+    def _to_floating(self, modes: ModeAdjoint) -> None:
+        """Gradients by the turns of floating frames, if there are any."""
         if modes.frames is not None:
+            if self.contact is not None:
+                self.contact.push_nodes(modes.frames.touch_p, modes.frames.touch_v)
             modes.frames.to_state(self.index, self.p, modes.wide_p, self.q, self.corner)
 
     def _to_tractions(self) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from softwarp.kernels.rows import (
@@ -72,6 +73,7 @@ class ContactAdjoint:
     drops_open = True  # whether what pushed in no solution is left out; nobody else may know contacts by their place
     knows_way = False  # whether ``way`` has been found from another p
     first_force: Rows | None = None  # of contacts in the first solution, where that is differentiated too
+    listed: tuple[Rows, Rows] | None = None  # rows of listed nodes that take what nodes have by places and velocities
     later: Rows | None = None  # what ``push_nodes`` adds by v: of later contacts, which look where it leads to
 
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
@@ -114,6 +116,13 @@ class ContactAdjoint:
             self.embedded = EmbeddedPoints(s, detector)
             self.top.node_dof, self.top.node_frame = self.embedded.node_dof, self.embedded.node_frame
         self.has_moving_frames = s.model.has_moving_frames  # which reads the device, as a recording cannot
+
+    def take_listed(self, node: wp.array, by_x: Rows, by_v: Rows) -> None:
+        """What nodes have is added to rows of listed ones from now on, which are all; but at the end of a way."""
+        if self.embedded is None:
+            self.embedded = EmbeddedPoints(self.shard, self.detector)
+        self.embedded.index_listed(node.numpy())
+        self.listed = by_x, by_v
 
     def begin(self, v: Rows, *, first: bool = True) -> None:
         """Sides of all contacts and their states.
@@ -262,7 +271,9 @@ class ContactAdjoint:
         x_bar, v_bar, *others = outputs
         places = [x_bar, v_bar] if self.embedded is None else self.embedded.begin()
         s.each_real(self.k_gather.gather, None, inputs, [*places, *others])
-        if self.embedded is not None:
+        if self.listed is not None and self.embedded is not None and not at_end:
+            self.embedded.spread_listed(*self.listed)
+        elif self.embedded is not None:
             self.embedded.spread(x_bar, v_bar)
 
     def _motion(self, p: Rows) -> tuple[Any, Any]:
@@ -294,7 +305,7 @@ class EmbeddedPoints:
     def __init__(self, shard: Shard, detector: Detector) -> None:
         self.shard, self.detector = shard, detector
         self.k, s = embedded_adjoint.kernels(shard.variant), shard
-        self.dofs, self.nodes, count = s.model.dof_room, detector.node_total, detector.embedded_count
+        self.dofs, self.nodes, count = s.model.dof_room, int(detector.node_dof.size), detector.embedded_count
         dof = np.concatenate([detector.node_dof.numpy(), self.dofs + np.arange(count)])
         frame = np.concatenate([detector.node_frame.numpy(), np.full(count, -1)])
         self.node_dof, self.node_frame = (wp.array(part, dtype=wp.int32, device=s.device) for part in (dof, frame))
@@ -305,6 +316,8 @@ class EmbeddedPoints:
     def velocities(self, given: list[Rows]) -> list[Rows]:
         """Velocities of dofs, and of embedded points behind them."""
         s, d = self.shard, self.detector
+        if not d.embedded_count:
+            return given
         for value, held in zip(given, self._held, strict=True):
             s.place(value, 3 * self.dofs, held, 0)
             inputs = [self.dofs, d.carrier, d.carrier_weight, d.node_dof]
@@ -323,3 +336,33 @@ class EmbeddedPoints:
         for moves, whole, bar in ((False, self._x, x_bar), (True, self._v, v_bar)):
             inputs = [s.lanes, self.nodes, moves, d.carrier, d.carrier_weight, d.node_dof, whole]
             s.each_real(self.k.spread, None, inputs, [bar])
+
+    def index_listed(self, listed: npt.NDArray[np.int32]) -> None:
+        """Find what every listed node takes from nodes and embedded points."""
+        d, device = self.detector, self.shard.device
+        count, moves = d.embedded_count, d.node_dof.numpy() >= 0
+        carrier, weight = d.carrier.numpy()[:count].reshape(-1), d.carrier_weight.numpy()[:count].reshape(-1)
+        own = d.point_nodes
+        node = np.concatenate([own, carrier])
+        source = np.concatenate([own, self.nodes + np.repeat(np.arange(count), 4)])
+        weight = np.concatenate([np.ones(len(own)), weight])
+        place = np.full(self.nodes, -1)
+        place[listed] = np.arange(len(listed))
+        order = np.argsort(place[node], kind="stable")
+        touched, start = np.unique(place[node][order], return_index=True)
+        start = np.append(start, len(order))
+
+        def integers(values: npt.NDArray[np.int64]) -> wp.array:
+            return wp.array(values, dtype=wp.int32, device=device)
+
+        self._touched = [integers(touched), integers(moves[listed[touched]]), integers(start)]
+        self._touched += [
+            integers(source[order]),
+            wp.array(weight[order], dtype=self.shard.variant.real, device=device),
+        ]
+
+    def spread_listed(self, by_x: Rows, by_v: Rows) -> None:
+        """Add it to rows of listed nodes, after ``index_listed``."""
+        s = self.shard
+        inputs = [s.lanes, *self._touched, self._x, self._v]
+        s.each_real(self.k.spread_listed, self._touched[0].size, inputs, [by_x.real, by_v.real])

@@ -72,6 +72,27 @@ for (; i + width <= count; i += width) {
 }
 for (; i < count; ++i) target[i] += value[i];
 """
+_COPY = """
+const REAL* value = &wp::index(value_in, pack, 0, 0) + first;
+__builtin_memcpy(&wp::index(target_out, pack, 0, 0) + start + first, value, (last - first) * sizeof(REAL));
+"""
+# A listed node of all worlds after the other, as worlds are read where they left off and lanes stand side by side.
+_TAKE = """
+const int lanes = listed_out.shape[2], begin = lanes * pack, rest = bar_out.shape[0] - begin;
+const int worlds = rest < lanes ? rest : lanes;
+REAL* listed = &wp::index(listed_out, pack, 0, 0);
+for (int l = 0; l < lanes; ++l) {
+    REAL* bar = &wp::index(bar_out, begin + (l < worlds ? l : 0), 0);
+    for (int i = 0; i < node.shape[0]; ++i) {
+        REAL* value = bar + 3 * node.data[i];
+        REAL* target = listed + 3 * lanes * i + l;
+        for (int c = 0; c < 3; ++c) target[lanes * c] = l < worlds ? value[c] : 0;
+    }
+}
+for (int l = 0; l < worlds; ++l)
+    for (int i = 0; i < node.shape[0]; ++i)
+        for (int c = 0; c < 3; ++c) wp::index(bar_out, begin + l, 3 * node.data[i] + c) = 0;
+"""
 # Eight registers of eight numbers, a, as columns, in b.
 TURN_ROWS = """
         for (int k = 0; k < 8; k += 2) {
@@ -167,6 +188,23 @@ def functions(real: Any) -> SimpleNamespace:
     ):
         """Add numbers ``first`` to ``last`` of a pack to those of another array."""
 
+    @wp.func_native(_COPY.replace("REAL", name))
+    def copy_numbers(
+        value_in: wp.array3d(dtype=real),
+        target_out: wp.array3d(dtype=real),
+        pack: int,
+        start: int,
+        first: int,
+        last: int,
+    ):
+        """Copy numbers ``first`` to ``last`` of a pack to those of another array, from ``start`` on."""
+
+    @wp.func_native(_TAKE.replace("REAL", name))
+    def take_nodes(
+        node: wp.array(dtype=wp.int32), bar_out: wp.array2d(dtype=real), listed_out: wp.array3d(dtype=real), pack: int
+    ):
+        """Gradients by listed nodes of the worlds of a pack; those of the state are 0 afterwards."""
+
     @wp.func_native(_INTERLEAVE.replace("TURN", TURN_ROWS).replace("REAL", name))
     def interleave_rows(
         source_in: wp.array2d(dtype=real),
@@ -194,6 +232,8 @@ def functions(real: Any) -> SimpleNamespace:
         are_near=are_near,
         are_same=are_same,
         add_numbers=add_numbers,
+        copy_numbers=copy_numbers,
+        take_nodes=take_nodes,
         interleave_rows=interleave_rows,
         store_rows=store_rows,
     )

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import packs
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 
@@ -20,10 +21,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     real, world_fastest = variant.real, variant.world_fastest
     module = variant.module("adjoint.modes")
+    take_of_pack = packs.functions(real).take_nodes
 
     @wp.kernel(module=module, enable_backward=False)
     def take_nodes(
-        lanes: int,
         # Model
         node: wp.array(dtype=wp.int32),
         # State out
@@ -32,20 +33,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         listed_out: wp.array3d(dtype=real),
     ):
         """Gradient by one listed node, which modes take over: the node's own is 0 afterwards; on a CPU of all."""
-        pack, part, lane = wp.tid()
-        world = pack * lanes + lane
-        first = int(0)
-        last = node.shape[0]
         if wp.static(world_fastest):
-            first = part
-            last = part + 1
-        for i in range(first, last):
+            pack, i, world = wp.tid()
             for c in range(3):
-                value = real(0.0)
-                if world < bar_out.shape[0]:
-                    value = bar_out[world, 3 * node[i] + c]
-                    bar_out[world, 3 * node[i] + c] = real(0.0)
-                listed_out[pack, 3 * i + c, lane] = value
+                listed_out[pack, 3 * i + c, world] = bar_out[world, 3 * node[i] + c]
+                bar_out[world, 3 * node[i] + c] = real(0.0)
+        else:
+            pack = wp.tid()
+            take_of_pack(node, bar_out, listed_out, pack)
 
     @wp.kernel(module=module, enable_backward=False)
     def add_modes(

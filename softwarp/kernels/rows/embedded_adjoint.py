@@ -70,4 +70,35 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             share = carrier_weight[point, j] * whole_in[world, 3 * (nodes + point) + c]
                             bar_out[world, 3 * node + c] = bar_out[world, 3 * node + c] + share
 
-    return SimpleNamespace(embed=embed, spread=spread)
+    @wp.kernel(module=module, enable_backward=False)
+    def spread_listed(
+        lanes: int,
+        # Model
+        touched: wp.array(dtype=wp.int32),
+        moves: wp.array(dtype=wp.int32),
+        start: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+        weight: wp.array(dtype=real),
+        # State
+        whole_x_in: wp.array2d(dtype=real),
+        whole_v_in: wp.array2d(dtype=real),
+        # Workspace out
+        by_x_out: wp.array3d(dtype=real),
+        by_v_out: wp.array3d(dtype=real),
+    ):
+        """The same for one node that may touch something, into rows of listed nodes."""
+        pack, item, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < whole_x_in.shape[0]:
+            row = 3 * touched[item]
+            by_x = vector_at(by_x_out, pack, lane, row)
+            by_v = vector_at(by_v_out, pack, lane, row)
+            for i in range(start[item], start[item + 1]):
+                for c in range(3):
+                    by_x[c] = by_x[c] + weight[i] * whole_x_in[world, 3 * source[i] + c]
+                    if moves[item] != 0:
+                        by_v[c] = by_v[c] + weight[i] * whole_v_in[world, 3 * source[i] + c]
+            put(by_x_out, pack, lane, row, by_x)
+            put(by_v_out, pack, lane, row, by_v)
+
+    return SimpleNamespace(embed=embed, spread=spread, spread_listed=spread_listed)
