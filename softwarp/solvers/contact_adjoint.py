@@ -305,6 +305,7 @@ class EmbeddedPoints:
     def __init__(self, shard: Shard, detector: Detector) -> None:
         self.shard, self.detector = shard, detector
         self.k, s = embedded_adjoint.kernels(shard.variant), shard
+        self.k_elements = embedded_adjoint.element_kernels(shard.variant)
         self.dofs, self.nodes, count = s.model.dof_room, int(detector.node_dof.size), detector.embedded_count
         dof = np.concatenate([detector.node_dof.numpy(), self.dofs + np.arange(count)])
         frame = np.concatenate([detector.node_frame.numpy(), np.full(count, -1)])
@@ -321,7 +322,7 @@ class EmbeddedPoints:
         for value, held in zip(given, self._held, strict=True):
             s.place(value, 3 * self.dofs, held, 0)
             inputs = [self.dofs, d.carrier, d.carrier_weight, d.node_dof]
-            s.each_real(self.k.embed, d.embedded_count, inputs, [held.real])
+            s.each(self.k_elements.embed, d.embedded_count, inputs, [held.S])
         return self._held
 
     def begin(self) -> list[wp.array]:

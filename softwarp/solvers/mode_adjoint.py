@@ -37,7 +37,7 @@ class ModeAdjoint:
         self.model: ReductionModel = term.model
         m = self.model
         self.k, self.k_modes = mode_adjoint.kernels(shard.variant), reduction.kernels(shard.variant)
-        self.k_loads = mode_loads.kernels(shard.variant)
+        self.k_elements, self.k_loads = mode_adjoint.element_kernels(shard.variant), mode_loads.kernels(shard.variant)
         self.listed, self.wide = shard.rows(3 * int(m.node.size)), shard.rows(m.wide_count)
         self.wide_v, self.wide_p = shard.rows(m.wide_count), shard.rows(m.wide_count)
         self.mass_p = shard.rows(m.count)
@@ -142,9 +142,10 @@ class ModeAdjoint:
     def to_state(self) -> None:
         """Gradients by the velocities at the start of the step; needs ``place``."""
         s, m = self.shard, self.model
-        inputs = [s.lanes, m.block_body, m.block_first, m.block_modes, m.block_volume, m.volume, m.mode_wide]
-        inputs += [s.input["density"].real, self.wide_p.real]
-        s.each_real(self.k.masses, m.count // 3, inputs, [self.gradients.mode_v, self.mass_p.real])
+        inputs = [m.block_first, m.block_modes, m.block_volume, m.volume, m.mode_wide, self.wide_p.S]
+        s.each(self.k_elements.masses, m.count // 3, inputs, [self.mass_p.S])
+        inputs = [s.lanes, m.block_body, s.input["density"].real, self.mass_p.real]
+        s.each_real(self.k.velocities, m.count // 3, inputs, [self.gradients.mode_v])
 
     def to_parameters(self) -> None:
         """Add the gradients by density, Rayleigh's alpha and gravity; needs ``to_state``."""

@@ -4,6 +4,7 @@ An embedded point moves with the weighted mean of four nodes. Where contacts are
 nodes, and velocities behind those of all dofs; what it has goes to its carriers. Theory: docs/theory/adjoint.md.
 """
 
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
@@ -18,26 +19,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     real = variant.real
     module = variant.module("adjoint.embedded")
     one = single.functions(variant)
-    vec3, vector_at, put = one.vec3, one.vector_at, one.put
-
-    @wp.kernel(module=module, enable_backward=False)
-    def embed(
-        dofs: int,
-        # Model
-        carrier: wp.array2d(dtype=wp.int32),
-        carrier_weight: wp.array2d(dtype=real),
-        node_dof: wp.array(dtype=wp.int32),
-        # Workspace out
-        velocity_out: wp.array3d(dtype=real),
-    ):
-        """Velocity of one embedded point, behind those of the dofs; fixed nodes stand still."""
-        pack, point, lane = wp.tid()
-        total = vec3()
-        for j in range(4):
-            dof = node_dof[carrier[point, j]]
-            if dof >= 0:
-                total += carrier_weight[point, j] * vector_at(velocity_out, pack, lane, 3 * dof)
-        put(velocity_out, pack, lane, 3 * (dofs + point), total)
+    vector_at, put = one.vector_at, one.put
 
     @wp.kernel(module=module, enable_backward=False)
     def spread(
@@ -101,4 +83,35 @@ def kernels(variant: Variant) -> SimpleNamespace:
             put(by_x_out, pack, lane, row, by_x)
             put(by_v_out, pack, lane, row, by_v)
 
-    return SimpleNamespace(embed=embed, spread=spread, spread_listed=spread_listed)
+    return SimpleNamespace(spread=spread, spread_listed=spread_listed)
+
+
+@cache
+def element_kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels on the elements of a variant, (w, row)."""
+    S, real, world_fastest = variant.S, variant.real, variant.world_fastest
+    module = variant.module("adjoint.embedded_elements")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def embed(
+        dofs: int,
+        # Model
+        carrier: wp.array2d(dtype=wp.int32),
+        carrier_weight: wp.array2d(dtype=real),
+        node_dof: wp.array(dtype=wp.int32),
+        # Workspace out
+        velocity_out: wp.array2d(dtype=S),
+    ):
+        """Velocity of one embedded point, behind those of the dofs; fixed nodes stand still."""
+        w, point = wp.tid()
+        if wp.static(world_fastest):
+            point, w = wp.tid()
+        for c in range(3):
+            total = S(real(0.0))
+            for j in range(4):
+                dof = node_dof[carrier[point, j]]
+                if dof >= 0:
+                    total += velocity_out[w, 3 * dof + c] * carrier_weight[point, j]
+            velocity_out[w, 3 * (dofs + point) + c] = total
+
+    return SimpleNamespace(embed=embed)
