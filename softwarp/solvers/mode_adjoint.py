@@ -64,10 +64,10 @@ class ModeAdjoint:
             if touched is not None:
                 self._add(touched, g.mode_v)
             return
-        dim = (s.packs, int(m.node.size), s.lanes) if s.variant.world_fastest else (s.packs,)
+        parts = s.variant.parts(int(m.node.size))
         taken = [(g.node_x, self.listed), (g.node_v, self.listed_v)]
         for by_nodes, listed in taken if moves else taken[:1]:
-            wp.launch(self.k.take_nodes, dim=dim, inputs=[m.node], outputs=[by_nodes, listed.real], device=s.device)
+            s.each_real(self.k.take_nodes, parts, [m.node], [by_nodes, listed.real])
         if self.frames is not None:
             if at_end:
                 self.frames.take_turns()

@@ -83,14 +83,14 @@ const int worlds = rest < lanes ? rest : lanes;
 REAL* listed = &wp::index(listed_out, pack, 0, 0);
 for (int l = 0; l < lanes; ++l) {
     REAL* bar = &wp::index(bar_out, begin + (l < worlds ? l : 0), 0);
-    for (int i = 0; i < node.shape[0]; ++i) {
+    for (int i = first; i < last; ++i) {
         REAL* value = bar + 3 * node.data[i];
         REAL* target = listed + 3 * lanes * i + l;
         for (int c = 0; c < 3; ++c) target[lanes * c] = l < worlds ? value[c] : 0;
     }
 }
 for (int l = 0; l < worlds; ++l)
-    for (int i = 0; i < node.shape[0]; ++i)
+    for (int i = first; i < last; ++i)
         for (int c = 0; c < 3; ++c) wp::index(bar_out, begin + l, 3 * node.data[i] + c) = 0;
 """
 # Eight registers of eight numbers, a, as columns, in b.
@@ -331,9 +331,14 @@ def functions(real: Any) -> SimpleNamespace:
 
     @wp.func_native(_TAKE.replace("REAL", name))
     def take_nodes(
-        node: wp.array(dtype=wp.int32), bar_out: wp.array2d(dtype=real), listed_out: wp.array3d(dtype=real), pack: int
+        node: wp.array(dtype=wp.int32),
+        pack: int,
+        first: int,
+        last: int,
+        bar_out: wp.array2d(dtype=real),
+        listed_out: wp.array3d(dtype=real),
     ):
-        """Gradients by listed nodes of the worlds of a pack; those of the state are 0 afterwards."""
+        """Gradients by listed nodes ``first`` to ``last`` of the worlds of a pack; 0 in the state afterwards."""
 
     @wp.func_native(_INTERLEAVE.replace("TURN", TURN_ROWS).replace("REAL", name))
     def interleave_rows(

@@ -33,15 +33,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         listed_out: wp.array3d(dtype=real),
     ):
-        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards; on a CPU of all."""
+        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards.
+
+        On a CPU a thread has its share of the nodes of a pack.
+        """
+        pack, part, lane = wp.tid()
         if wp.static(world_fastest):
-            pack, i, world = wp.tid()
             for c in range(3):
-                listed_out[pack, 3 * i + c, world] = bar_out[world, 3 * node[i] + c]
-                bar_out[world, 3 * node[i] + c] = real(0.0)
+                listed_out[pack, 3 * part + c, lane] = bar_out[lane, 3 * node[part] + c]
+                bar_out[lane, 3 * node[part] + c] = real(0.0)
         else:
-            pack = wp.tid()
-            take_of_pack(node, bar_out, listed_out, pack)
+            lanes = listed_out.shape[2]
+            count = node.shape[0]
+            first = lane * count / lanes
+            take_of_pack(node, pack, first, (lane + 1) * count / lanes, bar_out, listed_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def add_modes(
