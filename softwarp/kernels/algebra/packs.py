@@ -197,6 +197,16 @@ struct Weighted {
         return wp::index(density, pack, body.data[row / 3], lane) * wp::index(array, pack, row, lane);
     }
 };
+if (lanes == 1) {  // a world alone, whose numbers follow each other
+    const REAL *sum = &wp::index(node_bar, pack, 0, 0), *mass = &wp::index(mass_p, pack, 0, 0);
+    REAL *x = &wp::index(x_bar, pack, 0), *v = &wp::index(v_bar, pack, 0);
+    for (int row = 3 * first; row < 3 * last; ++row) x[row] += sum[row];
+    for (int node = first; node < last; ++node) {
+        const REAL weight = wp::index(density, pack, node_body.data[node], 0);
+        for (int c = 0; c < 3; ++c) v[3 * node + c] = weight * mass[3 * node + c];
+    }
+    return;
+}
 give(Sum{node_bar, pack}, [&](int world, int row, auto value) {
     auto total = value;
     __builtin_memcpy(&total, &wp::index(x_bar, world, row), sizeof(total));
@@ -219,6 +229,12 @@ struct Scaled {
     }
     REAL operator()(int row, int lane) const { return h * wp::index(array, pack, row, lane); }
 };
+if (lanes == 1) {
+    const REAL* value = &wp::index(node_p, pack, 0, 0);
+    REAL* target = &wp::index(force_bar, pack, 0);
+    for (int row = first; row < last; ++row) target[row] = h * value[row];
+    return;
+}
 give(Scaled{node_p, pack, h}, [&](int world, int row, auto value) {
     __builtin_memcpy(&wp::index(force_bar, world, row), &value, sizeof(value));
 });
