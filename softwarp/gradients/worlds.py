@@ -406,7 +406,7 @@ class DifferentiableWorlds:
                 if velocities or name != "node_v":
                     view.copy_(end[name])
         follows = self.model.reduction is not None
-        key = parameters, forces or not follows, velocities or not follows, is_known
+        key = parameters, forces, velocities or not follows, is_known
         if room is None:
             self._pull[key]()
             return

@@ -78,6 +78,7 @@ class StepAdjoint:
         self.shard, self.model = s, m
         self.k = adjoint_sums.kernels(s.variant)
         self.k_rows, self.k_chambers = of_rows.kernels(s.variant), cavity_adjoint.kernels(s.variant)
+        self.k_row_elements = of_rows.element_kernels(s.variant)
         self.k_surface = None if s.variant.world_fastest else cavity_surface.kernels(s.variant)
         rows, points = max(m.row_count, 1), max(len(m.point_node), 1)
         self.seed, self.p = s.rows(3 * m.dof_count), s.rows(3 * m.dof_room)
@@ -127,7 +128,11 @@ class StepAdjoint:
         self.contact = None if system.contact is None else self.touches(system, h, gradients)
         self.has_modes_alone = self.modes is not None and m.own_node_count == 0 and self.frames is None
         if self.modes is not None:
-            self.modes.is_lone = self.has_modes_alone and self.contact is None
+            self.modes.is_lone = self.has_modes_alone and self.contact is None and not self.predicts
+            self.modes.has_sums = self.modes.is_lone
+            if self.has_modes_alone and self.contact is not None and not leans:
+                self.modes.has_sums = True
+                self.contact.take_listed(self.modes.model.node, self.modes.listed, self.modes.listed_v)
         self.by_forces = True
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
 
@@ -344,11 +349,10 @@ class StepAdjoint:
         A pass is a solution with what p and q leave of the first equation; the first one brings q = 0, the second what
         q adds and what rounding has left, which further ones do again.
         """
-        s, m, h, w = self.shard, self.model, self.h, self.shard.work
+        s, m, w = self.shard, self.model, self.shard.work
         self._correct(first=True)
         for _ in range(max(1, self.system.options.refinement)):
-            inputs = [h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, w.compliance.real]
-            s.each_real(self.k_rows.gaps, m.row_count, [*inputs, self.force.real, self.q.real], [self.gap.real])
+            self._find_gaps(self.q, self.gap)
             inputs = [m.row_count, delassus.real, w.compliance.real, self.active.real, self.gap.real]
             outputs = [self.factor.real, self.change.real, self.q.real]
             s.each_real(self.k_rows.solve, None, inputs, outputs)
@@ -383,14 +387,24 @@ class StepAdjoint:
 
     def to_commands(self, *, follows: bool = True) -> None:
         """Gradients by commands, and by the constants of cables; none where rows do not follow any."""
-        s, m, w = self.shard, self.model, self.shard.work
         if not follows:
             self.measured.zero()
             self.start.zero()
-        elif m.row_count:
-            inputs = [self.h, m.row_entry_start, m.entry_dof, w.row.real, self.p.real, self.force.real]
-            s.each_real(self.k_rows.bounds, m.row_count, [*inputs, self.active.real], [self.bound.real])
+        elif self.model.row_count:
+            self.find_bounds(self.bound)
             self._of_targets()
+
+    def _find_gaps(self, q: Rows, gap: Rows) -> None:
+        """y_T + h H p - C q of the static rows."""
+        s, m, w = self.shard, self.model, self.shard.work
+        inputs = [self.h, m.row_entry_start, m.entry_dof, w.row.S, self.p.S, w.compliance.S, self.force.S, q.S]
+        s.each(self.k_row_elements.gaps, m.row_count, inputs, [gap.S])
+
+    def find_bounds(self, bound: Rows) -> None:
+        """Gradients by the bounds of static rows."""
+        self._find_gaps(self.none, self.gap)
+        inputs = [self.gap.real, self.active.real]
+        self.shard.each_real(self.k_rows.bounds, self.model.row_count, inputs, [bound.real])
 
     def _of_targets(self) -> None:
         """The same from q and the gradients by bounds."""
@@ -462,11 +476,11 @@ class StepAdjoint:
             return
         inputs = [h, m.point_node, m.point_weight, self.index.point_row, self.row_v.S, self.node_p.S]
         s.each(self.k.points, len(m.point_node), [*inputs, w.multiplier.S, self.q.S], [self.way.S])
-        fields = [w.point_x.real, w.point_gradient.real, self.way.real, self.measured.real]
-        inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *fields]
-        s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.point.real])
+        fields = [w.point_x, w.point_gradient, self.way, self.measured]
+        inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *(part.S for part in fields)]
+        s.each(self.k_row_elements.cable_points, m.point_count, inputs, [self.point.S])
         if m.cavities is not None:
-            self._to_surfaces(m.cavities, fields)
+            self._to_surfaces(m.cavities, [part.real for part in fields])
 
     def _feel(self) -> None:
         """What elements and rows have in the place of velocities."""
@@ -494,36 +508,44 @@ class StepAdjoint:
     def _to_state(self) -> None:
         """Gradients by positions, velocities and forces of nodes."""
         s, m, i, g, x = self.shard, self.model, self.shard.input, self.gradients, self.index
-        if self.modes is not None and self.modes.is_lone:
+        if self.modes is not None and self.modes.has_sums:
             self._to_modes(self.modes)
             return
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
         inputs += [self.corner.S, self.point.S]
         s.each(self.k.node_sums, s.variant.parts(m.node_count), inputs, [self.node_bar.S])
-        inputs = [self.h, s.lanes, m.node_body, i["density"].real]
-        inputs += [self.node_p.real, self.node_mass_p.real, self.node_bar.real]
-        s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v, g.command_node_force])
+        inputs = [s.lanes, m.node_body, i["density"].real]
+        inputs += [self.node_mass_p.real, self.node_bar.real]
+        s.each_real(self.k.nodes, s.variant.parts(m.node_count), inputs, [g.node_x, g.node_v])
         if self.modes is not None:
             self.modes.to_state()
-            if self.modes.frames is not None:
-                if self.contact is not None:
-                    self.contact.push_nodes(self.modes.frames.touch_p, self.modes.frames.touch_v)
-                self.modes.frames.to_state(self.index, self.p, self.modes.wide_p, self.q, self.corner)
-        self._to_tractions()
+            self._to_floating(self.modes)
+        self._to_forces()
 
     def _to_modes(self, modes: ModeAdjoint) -> None:
         """The same where all nodes follow modes, and elements and rows are all that nodes have a part in."""
-        s, m, x = self.shard, self.model, self.index
+        m, x = self.model, self.index
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
         modes.sum([*inputs, self.corner.S, self.point.S])
         modes.to_state()
-        if self.by_forces:
-            parts = s.variant.parts(3 * m.node_count)
-            inputs = [self.h, s.lanes, self.node_p.real]
-            s.each_real(self.k.node_forces, parts, inputs, [self.gradients.command_node_force])
-            self._to_tractions()
+        self._to_forces()
+        self._to_floating(modes)
+
+    def _to_floating(self, modes: ModeAdjoint) -> None:
+        """Gradients by the turns of floating frames, if there are any."""
         if modes.frames is not None:
+            if self.contact is not None:
+                self.contact.push_nodes(modes.frames.touch_p, modes.frames.touch_v)
             modes.frames.to_state(self.index, self.p, modes.wide_p, self.q, self.corner)
+
+    def _to_forces(self) -> None:
+        """Gradients by the forces on nodes and by tractions, if these are asked for."""
+        s, m, g = self.shard, self.model, self.gradients
+        if not self.by_forces:
+            return
+        inputs = [self.h, s.lanes, self.node_p.real]
+        s.each_real(self.k.node_forces, s.variant.parts(3 * m.node_count), inputs, [g.command_node_force])
+        self._to_tractions()
 
     def _to_tractions(self) -> None:
         s, m, g = self.shard, self.model, self.gradients

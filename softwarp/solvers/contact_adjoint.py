@@ -8,9 +8,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
-from softwarp.kernels.rows import contact_adjoint, elimination, embedded_adjoint, touch_adjoint, touch_gather
+from softwarp.kernels.rows import (
+    contact_adjoint,
+    contact_equations,
+    elimination,
+    embedded_adjoint,
+    touch_adjoint,
+    touch_gather,
+)
 from softwarp.model import memory
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.collision.detector import Detector
@@ -62,7 +70,10 @@ class ContactAdjoint:
     """
 
     forward = False  # whether the equations are those of changes of forces
+    drops_open = True  # whether what pushed in no solution is left out; nobody else may know contacts by their place
     knows_way = False  # whether ``way`` has been found from another p
+    first_force: Rows | None = None  # of contacts in the first solution, where that is differentiated too
+    listed: tuple[Rows, Rows] | None = None  # rows of listed nodes that take what nodes have by places and velocities
     later: Rows | None = None  # what ``push_nodes`` adds by v: of later contacts, which look where it leads to
 
     def __init__(self, system: System, h: float, gradients: Gradients) -> None:
@@ -72,18 +83,18 @@ class ContactAdjoint:
         self.laws, self.contacts, self.shard = system.multipliers.laws, system.contact.contacts, system.shard
         self.pairs, self.subspace = system.contact.pairs, system.contact.subspace
         s = self.shard
-        self.k = contact_adjoint.kernels(s.variant, self.forward)
+        self.k, self.k_laws = contact_adjoint.kernels(s.variant), contact_equations.kernels(s.variant, self.forward)
         self.z, self.mode = s.rows(3 * self.contacts.capacity), s.rows(4 * self.contacts.capacity)
         self.spare, self.offset, self.way, self.force = (s.rows(3 * self.contacts.capacity) for _ in range(4))
         self.detector = system.contact.detector
         self.unsure = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self._prepare_touches()
         order, worlds = self.laws.order, s.packs * s.lanes
+        sizes = order * elimination.stride_of(order), order * elimination.ROWS
         if s.variant.world_fastest:
-            self.matrix = rows.allocate_whole(s.variant, s.world_count, order**2, s.device).real
+            self.matrix, self.held = (rows.allocate_whole(s.variant, s.world_count, n, s.device).real for n in sizes)
         else:
-            self.matrix = memory.zeros((worlds, order**2, 1), s.variant.real, s.device)
-            self.held = memory.zeros((worlds, elimination.ROWS * order, 1), s.variant.real, s.device)
+            self.matrix, self.held = (memory.zeros((worlds, n, 1), s.variant.real, s.device) for n in sizes)
         self.is_new = True  # so that factors of the equations are to be found
 
     def _prepare_touches(self) -> None:
@@ -106,6 +117,13 @@ class ContactAdjoint:
             self.top.node_dof, self.top.node_frame = self.embedded.node_dof, self.embedded.node_frame
         self.has_moving_frames = s.model.has_moving_frames  # which reads the device, as a recording cannot
 
+    def take_listed(self, node: wp.array, by_x: Rows, by_v: Rows) -> None:
+        """What nodes have is added to rows of listed ones from now on, which are all; but at the end of a way."""
+        if self.embedded is None:
+            self.embedded = EmbeddedPoints(self.shard, self.detector)
+        self.embedded.index_listed(node.numpy())
+        self.listed = by_x, by_v
+
     def begin(self, v: Rows, *, first: bool = True) -> None:
         """Sides of all contacts and their states.
 
@@ -118,10 +136,21 @@ class ContactAdjoint:
         self._expand(v)
         self.z.zero()
         if first:
+            if self.drops_open:
+                self._drop_open()
             c.first.zero()
             self.laws.sides(self.system.linear)
         inputs = [self.h, c.count.real, *self._rows(), c.mu.real, c.multiplier.real, v.real]
         s.each_real(self.k.modes, c.capacity, inputs, [self.mode.real])
+
+    def _drop_open(self) -> None:
+        """Leave out contacts that pushed in no solution, which have no part in anything."""
+        c, d, s = self.contacts, self.detector, self.shard
+        first_force = c.multiplier if self.first_force is None else self.first_force
+        outputs = [c.count.real, c.listed.real, c.key.real, c.pair.real, c.dof.real, d.couple.real, d.face.real]
+        outputs += [self.look.real, c.weight.real, c.lever.real, c.axes.real, c.gap.real, c.mu.real]
+        outputs += [c.restitution.real, c.compliance.real, c.multiplier.real, first_force.real, self.normal.real]
+        s.each_real(self.k.drop_open, None, [9 if self.normal is c.axes else 3], outputs)
 
     def add_forces(self, y: Rows) -> None:
         """y -= h H' z."""
@@ -153,7 +182,7 @@ class ContactAdjoint:
             active: Which static rows are between their bounds.
             first: Whether the factor is a new one.
         """
-        laws, c, s, h, w = self.laws, self.contacts, self.shard, self.h, self.shard.work
+        laws, c, s, h, w, k = self.laws, self.contacts, self.shard, self.h, self.shard.work, self.k_laws
         if first:
             self.is_new = True
             laws.delassus(y, h * h, whole=True)
@@ -164,10 +193,14 @@ class ContactAdjoint:
         inputs = [c.count.real, laws.matrix.real, w.compliance.real, c.compliance.real]
         inputs += [active.real, self.mode.real, c.mu.real, laws.gap.real, self.offset.real]
         outputs, sizes = [laws.change.real, q.real, self.z.real, self.unsure], [laws.static_rows, laws.order]
-        if s.variant.world_fastest:
-            s.each_real(self.k.solve, None, [*sizes, *inputs], [self.matrix, *outputs])
-        else:
-            s.each_real(self.k.solve_again, None, [*sizes, self.is_new, *inputs], [self.matrix, self.held, *outputs])
+        if self.is_new:
+            s.each_real(k.note_equations, None, [*sizes, *inputs, self.z.real], [self.held])
+            of_worlds, items = [*sizes, c.count.real, laws.matrix.real, self.held], 1
+            if s.variant.world_fastest:
+                items = laws.order
+            wp.launch(k.fill_matrices, s.variant.dim(s.width, items), of_worlds, [self.matrix], device=s.device)
+            s.each_real(k.factor_matrix, None, [*sizes, c.count.real], [self.matrix, self.held])
+        s.each_real(k.solve_again, None, [*sizes, *inputs, self.matrix], [self.held, *outputs])
         self.is_new = False
         laws.add_change(y, -h)
 
@@ -238,7 +271,9 @@ class ContactAdjoint:
         x_bar, v_bar, *others = outputs
         places = [x_bar, v_bar] if self.embedded is None else self.embedded.begin()
         s.each_real(self.k_gather.gather, None, inputs, [*places, *others])
-        if self.embedded is not None:
+        if self.listed is not None and self.embedded is not None and not at_end:
+            self.embedded.spread_listed(*self.listed)
+        elif self.embedded is not None:
             self.embedded.spread(x_bar, v_bar)
 
     def _motion(self, p: Rows) -> tuple[Any, Any]:
@@ -270,7 +305,8 @@ class EmbeddedPoints:
     def __init__(self, shard: Shard, detector: Detector) -> None:
         self.shard, self.detector = shard, detector
         self.k, s = embedded_adjoint.kernels(shard.variant), shard
-        self.dofs, self.nodes, count = s.model.dof_room, detector.node_total, detector.embedded_count
+        self.k_elements = embedded_adjoint.element_kernels(shard.variant)
+        self.dofs, self.nodes, count = s.model.dof_room, int(detector.node_dof.size), detector.embedded_count
         dof = np.concatenate([detector.node_dof.numpy(), self.dofs + np.arange(count)])
         frame = np.concatenate([detector.node_frame.numpy(), np.full(count, -1)])
         self.node_dof, self.node_frame = (wp.array(part, dtype=wp.int32, device=s.device) for part in (dof, frame))
@@ -281,10 +317,12 @@ class EmbeddedPoints:
     def velocities(self, given: list[Rows]) -> list[Rows]:
         """Velocities of dofs, and of embedded points behind them."""
         s, d = self.shard, self.detector
+        if not d.embedded_count:
+            return given
         for value, held in zip(given, self._held, strict=True):
             s.place(value, 3 * self.dofs, held, 0)
             inputs = [self.dofs, d.carrier, d.carrier_weight, d.node_dof]
-            s.each_real(self.k.embed, d.embedded_count, inputs, [held.real])
+            s.each(self.k_elements.embed, d.embedded_count, inputs, [held.S])
         return self._held
 
     def begin(self) -> list[wp.array]:
@@ -299,3 +337,33 @@ class EmbeddedPoints:
         for moves, whole, bar in ((False, self._x, x_bar), (True, self._v, v_bar)):
             inputs = [s.lanes, self.nodes, moves, d.carrier, d.carrier_weight, d.node_dof, whole]
             s.each_real(self.k.spread, None, inputs, [bar])
+
+    def index_listed(self, listed: npt.NDArray[np.int32]) -> None:
+        """Find what every listed node takes from nodes and embedded points."""
+        d, device = self.detector, self.shard.device
+        count, moves = d.embedded_count, d.node_dof.numpy() >= 0
+        carrier, weight = d.carrier.numpy()[:count].reshape(-1), d.carrier_weight.numpy()[:count].reshape(-1)
+        own = d.point_nodes
+        node = np.concatenate([own, carrier])
+        source = np.concatenate([own, self.nodes + np.repeat(np.arange(count), 4)])
+        weight = np.concatenate([np.ones(len(own)), weight])
+        place = np.full(self.nodes, -1)
+        place[listed] = np.arange(len(listed))
+        order = np.argsort(place[node], kind="stable")
+        touched, start = np.unique(place[node][order], return_index=True)
+        start = np.append(start, len(order))
+
+        def integers(values: npt.NDArray[np.int64]) -> wp.array:
+            return wp.array(values, dtype=wp.int32, device=device)
+
+        self._touched = [integers(touched), integers(moves[listed[touched]]), integers(start)]
+        self._touched += [
+            integers(source[order]),
+            wp.array(weight[order], dtype=self.shard.variant.real, device=device),
+        ]
+
+    def spread_listed(self, by_x: Rows, by_v: Rows) -> None:
+        """Add it to rows of listed nodes, after ``index_listed``."""
+        s = self.shard
+        inputs = [s.lanes, *self._touched, self._x, self._v]
+        s.each_real(self.k.spread_listed, self._touched[0].size, inputs, [by_x.real, by_v.real])

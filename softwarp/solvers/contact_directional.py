@@ -24,7 +24,7 @@ class ContactDirection(ContactAdjoint):
         u_slope: Slopes of the first solution's velocities, where contacts look at where it leads to.
     """
 
-    forward = True
+    forward, drops_open = True, False
 
     def __init__(self, system: System, h: float, slopes: Gradients) -> None:
         super().__init__(system, h, slopes)

@@ -127,9 +127,10 @@ class StepDirection(StepAdjoint):
         s, m, w, f, d = self.shard, self.model, self.shard.work, self.gradients, self.slopes
         inputs = [m.point_node, m.point_weight, self.slope["node_x"].real]
         s.each_real(self.k_turn.points, len(m.point_node), inputs, [self.point_slope.real])
-        fields = [w.point_x.real, w.point_gradient.real, self.point_slope.real, self.none.real]
-        inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *fields]
-        s.each_real(self.k_rows.cable_points, m.point_count, inputs, [self.gradient_slope.real])
+        along = [w.point_x, w.point_gradient, self.point_slope, self.none]
+        inputs = [m.cable_point_start_device, m.point_cable, m.cable_closing_length, *(part.S for part in along)]
+        s.each(self.k_row_elements.cable_points, m.point_count, inputs, [self.gradient_slope.S])
+        fields = [part.real for part in along]
         products = [(0, f"command_{name}") for name in TARGETS[0]]
         if m.cable_elastic.any():
             products += [(0, name) for name in CONSTANTS]

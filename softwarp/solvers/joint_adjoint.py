@@ -100,7 +100,7 @@ class JointAdjoint(JointSides):
         held = [self.u, self.force, self.differences]
         if self.contact is not None:
             self.contact_force = [s.rows(3 * self.contact.contacts.capacity) for _ in range(1 + self.last)]
-            self.contact.knows_way = True
+            self.contact.knows_way, self.contact.drops_open = True, False
             held.append(self.contact_force)
         self.solution = [part.real for parts in held for part in parts]
         owner.system.watch = self.keep
@@ -273,7 +273,7 @@ class JointAdjoint(JointSides):
 
     def _project(self) -> None:
         """p and q of the velocities that momentum is projected to; what is passed to forces of the last solution."""
-        owner, s, m, w = self.owner, self.shard, self.shard.model, self.shard.work
+        owner, w = self.owner, self.shard.work
         self._hold(w.joint_gap, 0.0, owner.change)
         w.compliance.copy_from(self.softness)
         owner.force.zero()
@@ -282,8 +282,7 @@ class JointAdjoint(JointSides):
             self.contact.mode.zero()  # none that responds
             self.contact.z.zero()
         self._solve(self.seed_kept)
-        inputs = [self.h, m.row_entry_start, m.entry_dof, w.row.real, owner.p.real, owner.force.real]
-        s.each_real(owner.k_rows.bounds, m.row_count, [*inputs, owner.active.real], [self.passed.real])
+        owner.find_bounds(self.passed)
         if self.contact is not None:  # forces of the last solution push here too
             self.contact.force.copy_from(self.contact.way)
         self.p_kept.copy_from(owner.p)

@@ -120,6 +120,7 @@ class Looking(StepAdjoint):
         turns = self.modes is not None and self.modes.frames is not None
         self.later = s.rows(3 * self.model.dof_room) if turns else None  # on nodes, which turn
         self.contact.look, self.contact.u, self.contact.normal = self.first.look, self.first.u, self.first.normal
+        self.contact.first_force = self.first.force
         g = gradients
         self.before = None if self.modes is None else wp.zeros_like(g.node_v)  # what of late contacts goes to modes
         self.comes_first = False  # whether the first solution is differentiated
@@ -167,9 +168,13 @@ class Looking(StepAdjoint):
 
     def _contacts_to_state(self, contact: ContactAdjoint) -> None:
         super()._contacts_to_state(contact)
-        if self.comes_first and self.before is not None:
-            s, bar = self.shard, self.gradients.node_v
-            s.each_real(self.k_look.take_back, s.variant.parts(bar.shape[1]), [s.lanes, self.before], [bar])
+        if self.comes_first and self.before is not None and self.modes is not None:
+            s, bar, m = self.shard, self.gradients.node_v, self.modes.model
+            if self.modes.has_sums:
+                inputs = [s.lanes, m.node, self.before]
+                s.each_real(self.k_look.take_listed, int(m.node.size), inputs, [self.modes.listed_v.real])
+            else:
+                s.each_real(self.k_look.take_back, s.variant.parts(bar.shape[1]), [s.lanes, self.before], [bar])
 
     def _look_back(self) -> None:
         """Gradients by where everything is at the end of the first solution's way."""

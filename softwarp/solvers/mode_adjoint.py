@@ -28,7 +28,8 @@ class ModeAdjoint:
         gradients: Arrays of these worlds.
 
     Attributes:
-        is_lone: Whether all nodes follow modes and touch nothing.
+        has_sums: Whether all nodes follow modes, and ``sum`` has what elements and rows give them.
+        is_lone: Whether they touch nothing besides; else contacts add to ``listed`` and ``listed_v``.
         by_velocities: Whether the end of a step may have gradients by velocities of nodes.
     """
 
@@ -37,7 +38,7 @@ class ModeAdjoint:
         self.model: ReductionModel = term.model
         m = self.model
         self.k, self.k_modes = mode_adjoint.kernels(shard.variant), reduction.kernels(shard.variant)
-        self.k_loads = mode_loads.kernels(shard.variant)
+        self.k_elements, self.k_loads = mode_adjoint.element_kernels(shard.variant), mode_loads.kernels(shard.variant)
         self.listed, self.wide = shard.rows(3 * int(m.node.size)), shard.rows(m.wide_count)
         self.wide_v, self.wide_p = shard.rows(m.wide_count), shard.rows(m.wide_count)
         self.mass_p = shard.rows(m.count)
@@ -46,7 +47,7 @@ class ModeAdjoint:
         self.listed_v = shard.rows(3 * int(m.node.size))
         self.k_sums = adjoint_sums.kernels(shard.variant)
         self.frames = None if m.floating is None else FloatingAdjoint(shard, term, h, gradients)
-        self.is_lone, self.by_velocities = False, True
+        self.has_sums, self.is_lone, self.by_velocities = False, False, True
 
     def take(self, *, at_end: bool = False, moves: bool = True) -> None:
         """Gradients by nodes become those by modes that they follow from.
@@ -56,15 +57,18 @@ class ModeAdjoint:
             moves: Whether there may be some by velocities of nodes.
         """
         s, m, g = self.shard, self.model, self.gradients
-        if self.is_lone and not at_end:  # ``sum`` has those by positions, and there are no others
+        if self.has_sums and not at_end:  # and there are no others
+            touched = None if self.is_lone else self.listed_v
             if self.frames is not None:
-                self.frames.turn_bars(self.listed, None, at_end=False)
+                self.frames.turn_bars(self.listed, touched, at_end=False)
             self._add(self.listed, g.mode_q)
+            if touched is not None:
+                self._add(touched, g.mode_v)
             return
         parts = s.variant.parts(int(m.node.size))
         taken = [(g.node_x, self.listed), (g.node_v, self.listed_v)]
         for by_nodes, listed in taken if moves else taken[:1]:
-            s.each_real(self.k.take_nodes, parts, [s.lanes, m.node], [by_nodes, listed.real])
+            s.each_real(self.k.take_nodes, parts, [m.node], [by_nodes, listed.real])
         if self.frames is not None:
             if at_end:
                 self.frames.take_turns()
@@ -112,6 +116,8 @@ class ModeAdjoint:
         """Gradients by listed nodes from those by corners and points; those behind the active ones have none."""
         s, m = self.shard, self.model
         self.listed.zero()
+        if not self.is_lone:
+            self.listed_v.zero()
         inputs = [m.active_count, m.node, *sums]
         s.each(self.k_sums.listed_sums, s.variant.parts(m.active_count), inputs, [self.listed.S])
 
@@ -136,9 +142,10 @@ class ModeAdjoint:
     def to_state(self) -> None:
         """Gradients by the velocities at the start of the step; needs ``place``."""
         s, m = self.shard, self.model
-        inputs = [s.lanes, m.block_body, m.block_first, m.block_modes, m.block_volume, m.volume, m.mode_wide]
-        inputs += [s.input["density"].real, self.wide_p.real]
-        s.each_real(self.k.masses, m.count // 3, inputs, [self.gradients.mode_v, self.mass_p.real])
+        inputs = [m.block_first, m.block_modes, m.block_volume, m.volume, m.mode_wide, self.wide_p.S]
+        s.each(self.k_elements.masses, m.count // 3, inputs, [self.mass_p.S])
+        inputs = [s.lanes, m.block_body, s.input["density"].real, self.mass_p.real]
+        s.each_real(self.k.velocities, m.count // 3, inputs, [self.gradients.mode_v])
 
     def to_parameters(self) -> None:
         """Add the gradients by density, Rayleigh's alpha and gravity; needs ``to_state``."""

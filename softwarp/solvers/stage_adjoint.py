@@ -103,7 +103,6 @@ class StageAdjoint(StepAdjoint):
         self.start_point = s.rows(s.work.point_gradient.real.shape[1])
         self.stage_modes = None
         if self.modes is not None:
-            self.modes.is_lone = False  # there are gradients by velocities
             self.stage_modes = StageModes(self.modes, self.k_stage)
             self.leaning.more_products = self.stage_modes.add_products
 

@@ -72,6 +72,27 @@ for (; i + width <= count; i += width) {
 }
 for (; i < count; ++i) target[i] += value[i];
 """
+_COPY = """
+const REAL* value = &wp::index(value_in, pack, 0, 0) + first;
+__builtin_memcpy(&wp::index(target_out, pack, 0, 0) + start + first, value, (last - first) * sizeof(REAL));
+"""
+# A listed node of all worlds after the other, as worlds are read where they left off and lanes stand side by side.
+_TAKE = """
+const int lanes = listed_out.shape[2], begin = lanes * pack, rest = bar_out.shape[0] - begin;
+const int worlds = rest < lanes ? rest : lanes;
+REAL* listed = &wp::index(listed_out, pack, 0, 0);
+for (int l = 0; l < lanes; ++l) {
+    REAL* bar = &wp::index(bar_out, begin + (l < worlds ? l : 0), 0);
+    for (int i = first; i < last; ++i) {
+        REAL* value = bar + 3 * node.data[i];
+        REAL* target = listed + 3 * lanes * i + l;
+        for (int c = 0; c < 3; ++c) target[lanes * c] = l < worlds ? value[c] : 0;
+    }
+}
+for (int l = 0; l < worlds; ++l)
+    for (int i = first; i < last; ++i)
+        for (int c = 0; c < 3; ++c) wp::index(bar_out, begin + l, 3 * node.data[i] + c) = 0;
+"""
 # Eight registers of eight numbers, a, as columns, in b.
 TURN_ROWS = """
         for (int k = 0; k < 8; k += 2) {
@@ -134,6 +155,152 @@ for (int k = 0; k < worlds; ++k) {
     for (int i = row; i < last; ++i) good[i] = value[lanes * i + k];
 }
 """
+# Gradients by nodes of the worlds of a pack, from where lanes stand side by side; squares of eight rows and worlds turn
+_GIVE = """
+#pragma clang fp contract(off)
+typedef REAL row_t __attribute__((vector_size(8 * sizeof(REAL)), aligned(4)));
+const int lanes = LANES.shape[2], begin = lanes * pack, rest = BAR.shape[0] - begin;
+const int worlds = rest < lanes ? rest : lanes;
+auto give = [&](auto at, auto put) {
+    int row = START;
+    if (lanes == 8)
+        for (; row + 8 <= END; row += 8) {
+            row_t a[8], b[8];
+            for (int k = 0; k < 8; ++k) a[k] = at(row + k, row_t{});
+TURN
+            for (int k = 0; k < worlds; ++k) put(begin + k, row, b[k]);
+        }
+    for (; row < END; ++row)
+        for (int k = 0; k < worlds; ++k) put(begin + k, row, at(row, k));
+};
+"""
+_GIVE_NODES = (
+    _GIVE.replace("LANES", "node_bar").replace("BAR", "x_bar").replace("START", "3 * first").replace("END", "3 * last")
+    + """
+struct Sum {
+    const wp::array_t<REAL>& array; const int pack;
+    row_t operator()(int row, row_t a) const {
+        __builtin_memcpy(&a, &wp::index(array, pack, row, 0), sizeof(a));
+        return a;
+    }
+    REAL operator()(int row, int lane) const { return wp::index(array, pack, row, lane); }
+};
+struct Weighted {
+    const wp::array_t<REAL>&array, &density; const wp::array_t<int>& body; const int pack;
+    row_t operator()(int row, row_t a) const {
+        row_t d;
+        __builtin_memcpy(&a, &wp::index(array, pack, row, 0), sizeof(a));
+        __builtin_memcpy(&d, &wp::index(density, pack, body.data[row / 3], 0), sizeof(d));
+        return d * a;
+    }
+    REAL operator()(int row, int lane) const {
+        return wp::index(density, pack, body.data[row / 3], lane) * wp::index(array, pack, row, lane);
+    }
+};
+if (lanes == 1) {  // a world alone, whose numbers follow each other
+    const REAL *sum = &wp::index(node_bar, pack, 0, 0), *mass = &wp::index(mass_p, pack, 0, 0);
+    REAL *x = &wp::index(x_bar, pack, 0), *v = &wp::index(v_bar, pack, 0);
+    for (int row = 3 * first; row < 3 * last; ++row) x[row] += sum[row];
+    for (int node = first; node < last; ++node) {
+        const REAL weight = wp::index(density, pack, node_body.data[node], 0);
+        for (int c = 0; c < 3; ++c) v[3 * node + c] = weight * mass[3 * node + c];
+    }
+    return;
+}
+give(Sum{node_bar, pack}, [&](int world, int row, auto value) {
+    auto total = value;
+    __builtin_memcpy(&total, &wp::index(x_bar, world, row), sizeof(total));
+    total += value;
+    __builtin_memcpy(&wp::index(x_bar, world, row), &total, sizeof(total));
+});
+give(Weighted{mass_p, density, node_body, pack}, [&](int world, int row, auto value) {
+    __builtin_memcpy(&wp::index(v_bar, world, row), &value, sizeof(value));
+});
+"""
+)
+_GIVE_FORCES = (
+    _GIVE.replace("LANES", "node_p").replace("BAR", "force_bar").replace("START", "first").replace("END", "last")
+    + """
+struct Scaled {
+    const wp::array_t<REAL>& array; const int pack; const REAL h;
+    row_t operator()(int row, row_t a) const {
+        __builtin_memcpy(&a, &wp::index(array, pack, row, 0), sizeof(a));
+        return h * a;
+    }
+    REAL operator()(int row, int lane) const { return h * wp::index(array, pack, row, lane); }
+};
+if (lanes == 1) {
+    const REAL* value = &wp::index(node_p, pack, 0, 0);
+    REAL* target = &wp::index(force_bar, pack, 0);
+    for (int row = first; row < last; ++row) target[row] = h * value[row];
+    return;
+}
+give(Scaled{node_p, pack, h}, [&](int world, int row, auto value) {
+    __builtin_memcpy(&wp::index(force_bar, world, row), &value, sizeof(value));
+});
+"""
+)
+_SEED = """
+#pragma clang fp contract(off)
+const int lanes = seed.shape[2], last_world = x_bar.shape[0] - 1;
+for (int l = 0; l < lanes; ++l) {
+    const int world = lanes * pack + l < last_world ? lanes * pack + l : last_world;
+    const REAL *x = &wp::index(x_bar, world, 0), *v = &wp::index(v_bar, world, 0);
+    REAL *a = &wp::index(seed, pack, 0, 0) + l, *b = &wp::index(y, pack, 0, 0) + l;
+    for (int dof = first; dof < last; ++dof) {
+        const int row = 3 * dof_node.data[dof];
+        const REAL* free = &wp::index(dof_free, dof, 0);
+        for (int c = 0; c < 3; ++c) {
+            // a dof behind all nodes is of a frame, which is prescribed
+            const REAL value = row < x_bar.shape[1] ? (v[row + c] + h * x[row + c]) * free[c] : 0;
+            a[lanes * (3 * dof + c)] = value, b[lanes * (3 * dof + c)] = value;
+        }
+    }
+}
+"""
+
+
+@cache
+def adjoint_functions(real: Any) -> SimpleNamespace:
+    """What takes gradients between the state and packs of worlds of a CPU, for one scalar type."""
+    name = "double" if real is wp.float64 else "float"
+
+    @wp.func_native(_GIVE_NODES.replace("TURN", TURN_ROWS).replace("REAL", name))
+    def give_nodes(
+        node_body: wp.array(dtype=wp.int32),
+        density: wp.array3d(dtype=real),
+        mass_p: wp.array3d(dtype=real),
+        node_bar: wp.array3d(dtype=real),
+        pack: int,
+        first: int,
+        last: int,
+        x_bar: wp.array2d(dtype=real),
+        v_bar: wp.array2d(dtype=real),
+    ):
+        """Gradients by positions and velocities of nodes ``first`` to ``last`` at the start of a step."""
+
+    @wp.func_native(_GIVE_FORCES.replace("TURN", TURN_ROWS).replace("REAL", name))
+    def give_forces(
+        h: real, node_p: wp.array3d(dtype=real), pack: int, first: int, last: int, force_bar: wp.array2d(dtype=real)
+    ):
+        """h p of rows ``first`` to ``last``."""
+
+    @wp.func_native(_SEED.replace("REAL", name))
+    def seed(
+        h: real,
+        dof_node: wp.array(dtype=wp.int32),
+        dof_free: wp.array2d(dtype=real),
+        x_bar: wp.array2d(dtype=real),
+        v_bar: wp.array2d(dtype=real),
+        pack: int,
+        first: int,
+        last: int,
+        seed: wp.array3d(dtype=real),
+        y: wp.array3d(dtype=real),
+    ):
+        """y_v + h y_x of dofs ``first`` to ``last``."""
+
+    return SimpleNamespace(give_nodes=give_nodes, give_forces=give_forces, seed=seed)
 
 
 @cache
@@ -167,6 +334,28 @@ def functions(real: Any) -> SimpleNamespace:
     ):
         """Add numbers ``first`` to ``last`` of a pack to those of another array."""
 
+    @wp.func_native(_COPY.replace("REAL", name))
+    def copy_numbers(
+        value_in: wp.array3d(dtype=real),
+        target_out: wp.array3d(dtype=real),
+        pack: int,
+        start: int,
+        first: int,
+        last: int,
+    ):
+        """Copy numbers ``first`` to ``last`` of a pack to those of another array, from ``start`` on."""
+
+    @wp.func_native(_TAKE.replace("REAL", name))
+    def take_nodes(
+        node: wp.array(dtype=wp.int32),
+        pack: int,
+        first: int,
+        last: int,
+        bar_out: wp.array2d(dtype=real),
+        listed_out: wp.array3d(dtype=real),
+    ):
+        """Gradients by listed nodes ``first`` to ``last`` of the worlds of a pack; 0 in the state afterwards."""
+
     @wp.func_native(_INTERLEAVE.replace("TURN", TURN_ROWS).replace("REAL", name))
     def interleave_rows(
         source_in: wp.array2d(dtype=real),
@@ -194,6 +383,8 @@ def functions(real: Any) -> SimpleNamespace:
         are_near=are_near,
         are_same=are_same,
         add_numbers=add_numbers,
+        copy_numbers=copy_numbers,
+        take_nodes=take_nodes,
         interleave_rows=interleave_rows,
         store_rows=store_rows,
     )

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra import single
+from softwarp.kernels.algebra import packs, single
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.elements import assembly
 from softwarp.kernels.elements.adjoint import PARAMETERS, ROWS
@@ -23,8 +23,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     S, real, mul, world_fastest = variant.S, variant.real, variant.mul, variant.world_fastest
     module = variant.module("adjoint.step")
-    one = single.functions(variant)
+    one, of_packs = single.functions(variant), packs.adjoint_functions(real)
     vec3, vector_at = one.vec3, one.vector_at
+    give_nodes, give_forces, seed_of_pack = of_packs.give_nodes, of_packs.give_forces, of_packs.seed
 
     @wp.func
     def world_vector(array: wp.array2d(dtype=real), world: int, row: int):
@@ -52,21 +53,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
         seed_out: wp.array3d(dtype=real),
         y_out: wp.array3d(dtype=real),
     ):
-        """y_v + h y_x of the dofs, twice; 0 at prescribed scalars. On a GPU, a thread has one.
+        """y_v + h y_x of the dofs, twice; 0 at prescribed scalars. On a GPU, a thread has one; on a CPU as ``nodes``.
 
         Lanes past the last world repeat it.
         """
         pack, part, lane = wp.tid()
-        world = wp.min(pack * lanes + lane, x_bar_in.shape[0] - 1)
-        first, last = rows_of(part, dof_node.shape[0])
-        for dof in range(first, last):
-            row = 3 * dof_node[dof]
+        count = dof_node.shape[0]
+        if wp.static(world_fastest):
+            row = 3 * dof_node[part]
             for c in range(3):
                 value = real(0.0)
                 if row < x_bar_in.shape[1]:  # else it is of a frame, which is prescribed
-                    value = (v_bar_in[world, row + c] + h * x_bar_in[world, row + c]) * dof_free[dof, c]
-                seed_out[pack, 3 * dof + c, lane] = value
-                y_out[pack, 3 * dof + c, lane] = value
+                    value = (v_bar_in[lane, row + c] + h * x_bar_in[lane, row + c]) * dof_free[part, c]
+                seed_out[pack, 3 * part + c, lane] = value
+                y_out[pack, 3 * part + c, lane] = value
+        else:
+            first = lane * count / lanes
+            last = (lane + 1) * count / lanes
+            seed_of_pack(h, dof_node, dof_free, x_bar_in, v_bar_in, pack, first, last, seed_out, y_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def to_nodes(
@@ -208,42 +212,43 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # State out
         force_bar_out: wp.array2d(dtype=real),
     ):
-        """Gradient by the forces on nodes, which is all that they have where they follow modes."""
+        """Gradient by the forces on nodes: on a GPU one component, on a CPU a share of a pack's."""
         pack, part, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < force_bar_out.shape[0]:
-            first, last = rows_of(part, force_bar_out.shape[1])
-            for row in range(first, last):
-                force_bar_out[world, row] = h * node_p_in[pack, row, lane]
+        count = force_bar_out.shape[1]
+        if wp.static(world_fastest):
+            force_bar_out[lane, part] = h * node_p_in[pack, part, lane]
+        else:
+            give_forces(h, node_p_in, pack, lane * count / lanes, (lane + 1) * count / lanes, force_bar_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def nodes(
-        h: real,
         lanes: int,
         # Model
         node_body: wp.array(dtype=wp.int32),
         # Workspace in
         density_in: wp.array3d(dtype=real),
-        node_p_in: wp.array3d(dtype=real),
         node_mass_p_in: wp.array3d(dtype=real),
         node_bar_in: wp.array3d(dtype=real),
         # State out
         x_bar_out: wp.array2d(dtype=real),
         v_bar_out: wp.array2d(dtype=real),
-        force_bar_out: wp.array2d(dtype=real),
     ):
-        """Gradients by positions, velocities and forces at the start of the step; on a GPU, a thread has one node."""
+        """Gradients by positions and velocities at the start of the step; on a GPU, a thread has one node.
+
+        On a CPU it has its share of those of a pack.
+        """
         pack, part, lane = wp.tid()
-        world = pack * lanes + lane
-        if world < x_bar_out.shape[0]:
-            first, last = rows_of(part, node_body.shape[0])
-            for node in range(first, last):
-                density = density_in[pack, node_body[node], lane]
-                for c in range(3):
-                    row = 3 * node + c
-                    x_bar_out[world, row] = x_bar_out[world, row] + node_bar_in[pack, row, lane]
-                    v_bar_out[world, row] = density * node_mass_p_in[pack, row, lane]
-                    force_bar_out[world, row] = h * node_p_in[pack, row, lane]
+        count = node_body.shape[0]
+        if wp.static(world_fastest):
+            density = density_in[pack, node_body[part], lane]
+            for c in range(3):
+                row = 3 * part + c
+                x_bar_out[lane, row] = x_bar_out[lane, row] + node_bar_in[pack, row, lane]
+                v_bar_out[lane, row] = density * node_mass_p_in[pack, row, lane]
+        else:
+            first = lane * count / lanes
+            last = (lane + 1) * count / lanes
+            give_nodes(node_body, density_in, node_mass_p_in, node_bar_in, pack, first, last, x_bar_out, v_bar_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def bodies(

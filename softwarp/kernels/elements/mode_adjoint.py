@@ -8,10 +8,12 @@ rows have p of nodes Phi p. Mass and weight are those of modes, per density:
 State arrays are ``[world, row]``, workspace arrays ``[pack, row, lane]``; wide modes as in ``reduction``.
 """
 
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import packs
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 
@@ -20,10 +22,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     real, world_fastest = variant.real, variant.world_fastest
     module = variant.module("adjoint.modes")
+    take_of_pack = packs.functions(real).take_nodes
 
     @wp.kernel(module=module, enable_backward=False)
     def take_nodes(
-        lanes: int,
         # Model
         node: wp.array(dtype=wp.int32),
         # State out
@@ -31,21 +33,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         listed_out: wp.array3d(dtype=real),
     ):
-        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards; on a CPU of all."""
+        """Gradient by one listed node, which modes take over: the node's own is 0 afterwards.
+
+        On a CPU a thread has its share of the nodes of a pack.
+        """
         pack, part, lane = wp.tid()
-        world = pack * lanes + lane
-        first = int(0)
-        last = node.shape[0]
         if wp.static(world_fastest):
-            first = part
-            last = part + 1
-        for i in range(first, last):
             for c in range(3):
-                value = real(0.0)
-                if world < bar_out.shape[0]:
-                    value = bar_out[world, 3 * node[i] + c]
-                    bar_out[world, 3 * node[i] + c] = real(0.0)
-                listed_out[pack, 3 * i + c, lane] = value
+                listed_out[pack, 3 * part + c, lane] = bar_out[lane, 3 * node[part] + c]
+                bar_out[lane, 3 * node[part] + c] = real(0.0)
+        else:
+            lanes = listed_out.shape[2]
+            count = node.shape[0]
+            first = lane * count / lanes
+            take_of_pack(node, pack, first, (lane + 1) * count / lanes, bar_out, listed_out)
 
     @wp.kernel(module=module, enable_backward=False)
     def add_modes(
@@ -87,35 +88,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
             y_out[pack, row, lane] = value
 
     @wp.kernel(module=module, enable_backward=False)
-    def masses(
+    def velocities(
         lanes: int,
         # Model
         block_body: wp.array(dtype=wp.int32),
-        block_first: wp.array(dtype=wp.int32),
-        block_modes: wp.array(dtype=wp.int32),
-        block_volume: wp.array(dtype=wp.int32),
-        volume: wp.array(dtype=real),
-        mode_wide: wp.array(dtype=wp.int32),
         # Workspace in
         density_in: wp.array3d(dtype=real),
-        wide_p_in: wp.array3d(dtype=real),
+        mass_p_in: wp.array3d(dtype=real),
         # State out
         v_bar_out: wp.array2d(dtype=real),
-        # Workspace out
-        mass_p_out: wp.array3d(dtype=real),
     ):
-        """M p per density of three modes, and the gradient by their velocities at the start of the step."""
+        """Gradient by the velocities of three modes at the start of the step."""
         pack, block, lane = wp.tid()
         world = pack * lanes + lane
-        count = block_modes[block]
-        for r in range(3):
-            total = real(0.0)
-            for k in range(count):
-                share = volume[block_volume[block] + r * count + k]
-                total += share * wide_p_in[pack, mode_wide[block_first[block] + k], lane]
-            mass_p_out[pack, 3 * block + r, lane] = total
-            if world < v_bar_out.shape[0]:
-                v_bar_out[world, 3 * block + r] = density_in[pack, block_body[block], lane] * total
+        if world < v_bar_out.shape[0]:
+            for row in range(3 * block, 3 * block + 3):
+                v_bar_out[world, row] = density_in[pack, block_body[block], lane] * mass_p_in[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
     def bodies(
@@ -162,4 +150,38 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 density_bar_out[world, body] = density_bar_out[world, body] + by_density
                 rayleigh_mass_bar_out[world, body] = rayleigh_mass_bar_out[world, body] + by_alpha
 
-    return SimpleNamespace(take_nodes=take_nodes, add_modes=add_modes, seed=seed, masses=masses, bodies=bodies)
+    return SimpleNamespace(take_nodes=take_nodes, add_modes=add_modes, seed=seed, velocities=velocities, bodies=bodies)
+
+
+@cache
+def element_kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels on the elements of a variant, (w, row)."""
+    S, real, world_fastest = variant.S, variant.real, variant.world_fastest
+    module = variant.module("adjoint.mode_elements")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def masses(
+        # Model
+        block_first: wp.array(dtype=wp.int32),
+        block_modes: wp.array(dtype=wp.int32),
+        block_volume: wp.array(dtype=wp.int32),
+        volume: wp.array(dtype=real),
+        mode_wide: wp.array(dtype=wp.int32),
+        # Workspace in
+        wide_p_in: wp.array2d(dtype=S),
+        # Workspace out
+        mass_p_out: wp.array2d(dtype=S),
+    ):
+        """M p per density of three modes."""
+        w, block = wp.tid()
+        if wp.static(world_fastest):
+            block, w = wp.tid()
+        count = block_modes[block]
+        for r in range(3):
+            total = S(real(0.0))
+            for k in range(count):
+                share = volume[block_volume[block] + r * count + k]
+                total += wide_p_in[w, mode_wide[block_first[block] + k]] * share
+            mass_p_out[w, 3 * block + r] = total
+
+    return SimpleNamespace(masses=masses)

@@ -67,6 +67,15 @@ def functions(variant: Variant) -> SimpleNamespace:
         return vector(m.zy - m.yz, m.xz - m.zx, m.yx - m.xy)
 
     @wp.func
+    def axial_of(m: Matrix, s: Matrix):
+        """``axial`` of m s, where s is symmetric."""
+        return vector(
+            dot(row_z(m), row_y(s)) - dot(row_y(m), row_z(s)),
+            dot(row_x(m), row_z(s)) - dot(row_z(m), row_x(s)),
+            dot(row_y(m), row_x(s)) - dot(row_x(m), row_y(s)),
+        )
+
+    @wp.func
     def skew(w: Vector):
         none = S(real(0.0))
         return rows(vector(none, -w.z, w.y), vector(w.z, none, -w.x), vector(-w.y, w.x, none))
@@ -124,6 +133,7 @@ def functions(variant: Variant) -> SimpleNamespace:
         shifted=shifted,
         stress=stress,
         axial=axial,
+        axial_of=axial_of,
         skew=skew,
         unturned=unturned,
         tensor_cross=tensor_cross,
@@ -173,7 +183,7 @@ def kernels(variant: Variant, is_large: bool, by_parameters: bool = True) -> Sim
     dot, cross, matmul, matvec, crossmul = a.dot, a.cross, a.matmul, a.matvec, a.crossmul
     summed, symmetric_part = a.summed, a.symmetric_part
     depth_below = frames.depth_below
-    times, ddot, trace, shifted, stress, axial = f.times, f.ddot, f.trace, f.shifted, f.stress, f.axial
+    times, ddot, trace, shifted, stress, axial_of = f.times, f.ddot, f.trace, f.shifted, f.stress, f.axial_of
     skew, unturned, tensor_cross, guarded = f.skew, f.unturned, f.tensor_cross, f.guarded
     edges, gradients, of_body, of_tet, of_scene = at.edges, at.gradients, at.of_body, at.of_tet, at.of_scene
     write_corner, write_corners = at.write_corner, at.write_corners
@@ -255,14 +265,14 @@ def kernels(variant: Variant, is_large: bool, by_parameters: bool = True) -> Sim
             by_F = summed(times(by_F, stiff * h), times(by_gamma, mul(k, tangent)))
             by_stiff = mul(push, along) * h
         k = mul(k, gamma)
-        turn = times(summed(matmul(M, sX), matmul(Xr, stress(strain, mu, lam))), one * h)
-        turn = summed(turn, times(summed(matmul(Xr, sY), matmul(Yr, sX)), k))
+        turn = axial_of(summed(times(M, one * h), times(Yr, k)), sX)
+        turn = add(turn, axial_of(Xr, summed(times(stress(strain, mu, lam), one * h), times(sY, k))))
         turned = times(sX, one * h)
         along_edges = Matrix()
         if wp.static(is_large):
-            along_edges = by_edges(matvec(R, axial(turn)), row_x(e), row_y(e))
+            along_edges = by_edges(matvec(R, turn), row_x(e), row_y(e))
         else:
-            turned = summed(turned, skew(unturned(symmetric_part(M), axial(turn))))
+            turned = summed(turned, skew(unturned(symmetric_part(M), turn)))
         by_F = times(summed(by_F, matmul(R, turned)), -volume)
         along_edges = times(along_edges, -volume)
         b = add(matvec(by_F, row_x(g)), row_x(along_edges))

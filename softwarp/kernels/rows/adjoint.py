@@ -13,12 +13,13 @@ by points. An equilibrium has the same equations with h = 1, v = 0 and the exact
 W = H A^-1 H' need not be symmetric. All arrays but those of the state are single worlds': (pack, row, lane).
 """
 
+from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
+from softwarp.kernels.algebra.vectors import algebra
 
 DEPENDENT = {wp.float64: 1.0e-12, wp.float32: 1.0e-6}  # relative pivot of a row that repeats others
 
@@ -28,8 +29,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels for one scalar type and memory order."""
     real = variant.real
     module = variant.module("adjoint.rows")
-    one = single.functions(variant)
-    vector_at, put = one.vector_at, one.put
     dependent = DEPENDENT[real]
 
     @wp.kernel(module=module, enable_backward=False)
@@ -60,30 +59,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """C q of one row."""
         pack, row, lane = wp.tid()
         out_out[pack, row, lane] = compliance_in[pack, row, lane] * q_in[pack, row, lane]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def gaps(
-        h: real,
-        # Model
-        row_entry_start: wp.array(dtype=wp.int32),
-        entry_dof: wp.array(dtype=wp.int32),
-        # Workspace in
-        row_in: wp.array3d(dtype=real),
-        dof_p_in: wp.array3d(dtype=real),
-        compliance_in: wp.array3d(dtype=real),
-        force_bar_in: wp.array3d(dtype=real),
-        q_in: wp.array3d(dtype=real),
-        # Workspace out
-        gap_out: wp.array3d(dtype=real),
-    ):
-        """What p and q leave of the equation of one row, y_T + h H p - C q."""
-        pack, row, lane = wp.tid()
-        value = real(0.0)
-        for entry in range(row_entry_start[row], row_entry_start[row + 1]):
-            p = vector_at(dof_p_in, pack, lane, 3 * entry_dof[entry])
-            value += wp.dot(vector_at(row_in, pack, lane, 3 * entry), p)
-        known = force_bar_in[pack, row, lane] - compliance_in[pack, row, lane] * q_in[pack, row, lane]
-        gap_out[pack, row, lane] = known + h * value
 
     @wp.kernel(module=module, enable_backward=False)
     def solve(
@@ -173,27 +148,15 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def bounds(
-        h: real,
-        # Model
-        row_entry_start: wp.array(dtype=wp.int32),
-        entry_dof: wp.array(dtype=wp.int32),
         # Workspace in
-        row_in: wp.array3d(dtype=real),
-        dof_p_in: wp.array3d(dtype=real),
-        force_bar_in: wp.array3d(dtype=real),
+        gap_in: wp.array3d(dtype=real),
         active_in: wp.array3d(dtype=wp.int32),
         # Workspace out
         bound_bar_out: wp.array3d(dtype=real),
     ):
-        """Gradient by the bound of one row, y_T + h H p; 0 between bounds."""
+        """Gradient by the bound of one row, from y_T + h H p of ``gaps``; 0 between bounds."""
         pack, row, lane = wp.tid()
-        value = real(0.0)
-        if active_in[pack, row, lane] == 0:
-            for entry in range(row_entry_start[row], row_entry_start[row + 1]):
-                p = vector_at(dof_p_in, pack, lane, 3 * entry_dof[entry])
-                value += wp.dot(vector_at(row_in, pack, lane, 3 * entry), p)
-            value = force_bar_in[pack, row, lane] + h * value
-        bound_bar_out[pack, row, lane] = value
+        bound_bar_out[pack, row, lane] = wp.where(active_in[pack, row, lane] == 0, gap_in[pack, row, lane], real(0.0))
 
     @wp.kernel(module=module, enable_backward=False)
     def cable_seed(
@@ -331,42 +294,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 stiffness_bar_out[world, cable] = stiffness_bar_out[world, cable] + by_k
                 damping_bar_out[world, cable] = damping_bar_out[world, cable] + by_c
 
-    @wp.func
-    def segment(x: wp.array3d(dtype=real), way: wp.array3d(dtype=real), pack: int, lane: int, last: int, closing: real):
-        """Change of the gradient at the first point of the cable segment that ends in point ``last``, by the ways."""
-        d = vector_at(x, pack, lane, 3 * last) - vector_at(x, pack, lane, 3 * last - 3)
-        change = vector_at(way, pack, lane, 3 * last) - vector_at(way, pack, lane, 3 * last - 3)
-        length = wp.length(d)
-        if length < closing:
-            return change / closing
-        u = d / length
-        return (change - u * wp.dot(u, change)) / length
-
-    @wp.kernel(module=module, enable_backward=False)
-    def cable_points(
-        # Model
-        cable_point_start: wp.array(dtype=wp.int32),
-        point_cable: wp.array(dtype=wp.int32),
-        cable_closing_length: wp.array(dtype=real),
-        # Workspace in
-        point_x_in: wp.array3d(dtype=real),
-        point_gradient_in: wp.array3d(dtype=real),
-        way_in: wp.array3d(dtype=real),
-        measured_in: wp.array3d(dtype=real),
-        # Workspace out
-        point_bar_out: wp.array3d(dtype=real),
-    ):
-        """Gradient by one point of a cable."""
-        pack, point, lane = wp.tid()
-        cable = point_cable[point]
-        closing = cable_closing_length[cable]
-        total = measured_in[pack, cable, lane] * vector_at(point_gradient_in, pack, lane, 3 * point)
-        if point > cable_point_start[cable]:
-            total -= segment(point_x_in, way_in, pack, lane, point, closing)
-        if point + 1 < cable_point_start[cable + 1]:
-            total += segment(point_x_in, way_in, pack, lane, point + 1, closing)
-        put(point_bar_out, pack, lane, 3 * point, total)
-
     @wp.kernel(module=module, enable_backward=False)
     def rest_lengths(
         lanes: int,
@@ -390,12 +317,88 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rest_lengths=rest_lengths,
         activity=activity,
         compliant=compliant,
-        gaps=gaps,
         solve=solve,
         eliminate=eliminate,
         bounds=bounds,
         cable_seed=cable_seed,
         cable_command=cable_command,
         cable_stretch=cable_stretch,
-        cable_points=cable_points,
     )
+
+
+@cache
+def element_kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels on the elements of a variant, (w, row)."""
+    S, real, world_fastest = variant.S, variant.real, variant.world_fastest
+    mul, fma, div, sqrt, select = variant.mul, variant.fma, variant.div, variant.sqrt, variant.select
+    module = variant.module("adjoint.row_elements")
+    a = algebra(variant)
+    read_vector, write_vector = a.read_vector, a.write_vector
+    add, subtract, scaled, dot = a.add, a.subtract, a.scaled, a.dot
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gaps(
+        h: real,
+        # Model
+        row_entry_start: wp.array(dtype=wp.int32),
+        entry_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        row_in: wp.array2d(dtype=S),
+        dof_p_in: wp.array2d(dtype=S),
+        compliance_in: wp.array2d(dtype=S),
+        force_bar_in: wp.array2d(dtype=S),
+        q_in: wp.array2d(dtype=S),
+        # Workspace out
+        gap_out: wp.array2d(dtype=S),
+    ):
+        """What p and q leave of the equation of one row, y_T + h H p - C q."""
+        w, row = wp.tid()
+        if wp.static(world_fastest):
+            row, w = wp.tid()
+        value = S(real(0.0))
+        for entry in range(row_entry_start[row], row_entry_start[row + 1]):
+            dof = 3 * entry_dof[entry]
+            for c in range(3):
+                value = fma(row_in[w, 3 * entry + c], dof_p_in[w, dof + c], value)
+        known = force_bar_in[w, row] - mul(compliance_in[w, row], q_in[w, row])
+        gap_out[w, row] = known + value * h
+
+    @wp.func
+    def segment(x: wp.array2d(dtype=S), way: wp.array2d(dtype=S), w: int, last: int, closing: S):
+        """Change of the gradient at the first point of the cable segment that ends in point ``last``, by the ways."""
+        d = subtract(read_vector(x, w, 3 * last), read_vector(x, w, 3 * last - 3))
+        change = subtract(read_vector(way, w, 3 * last), read_vector(way, w, 3 * last - 3))
+        length = sqrt(dot(d, d))
+        inverse = div(S(real(1.0)), wp.max(length, closing))
+        u = scaled(d, inverse)
+        along = select(closing - length, S(real(0.0)), dot(u, change))
+        return scaled(subtract(change, scaled(u, along)), inverse)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def cable_points(
+        # Model
+        cable_point_start: wp.array(dtype=wp.int32),
+        point_cable: wp.array(dtype=wp.int32),
+        cable_closing_length: wp.array(dtype=real),
+        # Workspace in
+        point_x_in: wp.array2d(dtype=S),
+        point_gradient_in: wp.array2d(dtype=S),
+        way_in: wp.array2d(dtype=S),
+        measured_in: wp.array2d(dtype=S),
+        # Workspace out
+        point_bar_out: wp.array2d(dtype=S),
+    ):
+        """Gradient by one point of a cable."""
+        w, point = wp.tid()
+        if wp.static(world_fastest):
+            point, w = wp.tid()
+        cable = point_cable[point]
+        closing = S(cable_closing_length[cable])
+        total = scaled(read_vector(point_gradient_in, w, 3 * point), measured_in[w, cable])
+        if point > cable_point_start[cable]:
+            total = subtract(total, segment(point_x_in, way_in, w, point, closing))
+        if point + 1 < cable_point_start[cable + 1]:
+            total = add(total, segment(point_x_in, way_in, w, point + 1, closing))
+        write_vector(point_bar_out, w, 3 * point, total)
+
+    return SimpleNamespace(gaps=gaps, cable_points=cable_points)

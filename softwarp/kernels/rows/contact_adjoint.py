@@ -23,15 +23,9 @@ import warp as wp
 
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.rows import elimination
 from softwarp.model.codes import SLOTS
 
 SLIPS = {wp.float64: 1.0e-8, wp.float32: 1.0e-4}  # relative distance of friction from its bound up to which it slips
-UNSOLVED = {
-    wp.float64: 1.0e-7,
-    wp.float32: 1.0e-3,
-}  # relative size of what rounding may leave of equations that repeat others
-DEPENDENT = {wp.float64: 1.0e-13, wp.float32: 1.0e-6}  # relative pivot of a row that repeats others
 
 
 @single_worlds
@@ -76,18 +70,12 @@ def functions(variant: Variant) -> SimpleNamespace:
 
 
 @single_worlds
-def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
-    """Kernels for one scalar type, on single worlds: (pack, row, lane).
-
-    Args:
-        variant: Scalar type and memory order.
-        forward: Solve for the change -z of forces instead, whose equations are the transposed ones.
-    """
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Kernels for one scalar type, on single worlds: (pack, row, lane)."""
     real = variant.real
-    module = variant.module("directional.laws" if forward else "adjoint.contact")
+    module = variant.module("adjoint.contact")
     one = single.functions(variant)
     vec3, vector_at = one.vec3, one.vector_at
-    dependent, unsolved = DEPENDENT[real], UNSOLVED[real]
     found = functions(variant)
     motion, along = found.motion, found.along
 
@@ -154,316 +142,85 @@ def kernels(variant: Variant, forward: bool = False) -> SimpleNamespace:
         mode_out[pack, 4 * contact + 3, lane] = r[2]
 
     @wp.func
-    def equation(
-        delassus: wp.array3d(dtype=real),
-        compliance: wp.array3d(dtype=real),
-        softness: wp.array3d(dtype=real),
-        active: wp.array3d(dtype=wp.int32),
-        mode: wp.array3d(dtype=real),
-        mu: wp.array3d(dtype=real),
-        gap: wp.array3d(dtype=real),
-        offset: wp.array3d(dtype=real),
-        q: wp.array3d(dtype=real),
-        z: wp.array3d(dtype=real),
-        pack: int,
-        lane: int,
-        rows: int,
-        order: int,
-        total: int,
-        i: int,
-        is_new: bool,
-        at: int,
-        place: int,
-        matrix_out: wp.array3d(dtype=real),
-        change_out: wp.array3d(dtype=real),
-    ):
-        """One row of the equations for the change of q and z: coefficients, and the right-hand side in ``change``.
-
-        The matrix is that at ``at`` and ``place``, and stays as it is unless it ``is_new``.
-        """
-        own = real(1.0)  # factors of this row of W, of the two tangents' rows, and of the unit matrix
-        first = real(0.0)
-        second = real(0.0)
-        unit = real(0.0)
-        before = real(0.0)
-        pressed = real(0.0)  # share of the pressure in friction
-        normal = int(-1)
-        is_open = bool(False)
-        t = i
-        if i < rows:
-            is_open = active[pack, i, lane] == 0
-            unit = compliance[pack, i, lane]  # the gap has C q in it already
-        else:
-            contact = (i - rows) / 3
-            axis = (i - rows) % 3
-            t = rows + 3 * contact + 1
-            state = mode[pack, 4 * contact, lane]
-            k = mode[pack, 4 * contact + 1, lane]
-            r1 = mode[pack, 4 * contact + 2, lane]
-            r2 = mode[pack, 4 * contact + 3, lane]
-            is_open = state == real(0.0)
-            if axis == 0:
-                unit = softness[pack, contact, lane]
-                before = unit * z[pack, 3 * contact, lane]
-                if state == real(2.0) and wp.static(not forward):
-                    first = mu[pack, contact, lane] * r1
-                    second = mu[pack, contact, lane] * r2
-            elif state == real(2.0):
-                unit = real(1.0)
-                before = z[pack, 3 * contact + axis, lane]
-                if wp.static(forward):
-                    normal = t - 1
-                    pressed = -mu[pack, contact, lane] * wp.where(axis == 1, r1, r2)
-                    before += pressed * z[pack, 3 * contact, lane] + offset[pack, 3 * contact + axis, lane]
-                own = real(0.0)
-                if axis == 1:
-                    first = k * (real(1.0) - r1 * r1)
-                    second = -k * r1 * r2
-                else:
-                    first = -k * r1 * r2
-                    second = k * (real(1.0) - r2 * r2)
-        u = wp.min(t + 1, total - 1)
-        right = own * gap[pack, i, lane] - before
-        if first != real(0.0) or second != real(0.0):
-            right += first * gap[pack, t, lane] + second * gap[pack, u, lane]
-        change_out[pack, i, lane] = wp.where(is_open, real(0.0), right)
-        if not is_new:
-            return
-        for j in range(total):
-            entry = own * delassus[pack, i * order + j, lane]
-            if first != real(0.0) or second != real(0.0):
-                entry += first * delassus[pack, t * order + j, lane] + second * delassus[pack, u * order + j, lane]
-            if i == j:
-                entry += unit
-            if j == normal:
-                entry += pressed
-            if is_open:
-                entry = wp.where(i == j, real(1.0), real(0.0))
-            matrix_out[at, i * order + j, place] = entry
+    def shift(array: wp.array3d(dtype=real), pack: int, lane: int, start: int, end: int, width: int):
+        """Copy the rows of one contact to those of another."""
+        for row in range(width):
+            array[pack, width * end + row, lane] = array[pack, width * start + row, lane]
 
     @wp.func
-    def swap(
-        matrix_out: wp.array3d(dtype=real),
-        change_out: wp.array3d(dtype=real),
-        pack: int,
-        lane: int,
-        order: int,
-        total: int,
-        i: int,
-        k: int,
-        first: int,
-    ):
-        """Exchange two rows from a column on."""
-        for j in range(first, total):
-            kept = matrix_out[pack, i * order + j, lane]
-            matrix_out[pack, i * order + j, lane] = matrix_out[pack, k * order + j, lane]
-            matrix_out[pack, k * order + j, lane] = kept
-        right = change_out[pack, i, lane]
-        change_out[pack, i, lane] = change_out[pack, k, lane]
-        change_out[pack, k, lane] = right
-
-    @wp.func
-    def unit_of(delassus: wp.array3d(dtype=real), pack: int, lane: int, order: int, i: int):
-        """Of one unknown, in which rows of pressures, tensions and contacts have pivots that compare."""
-        own = delassus[pack, i * order + i, lane]
-        return wp.where(own > real(0.0), real(1.0) / wp.sqrt(own), real(1.0))
+    def shift_integers(array: wp.array3d(dtype=wp.int32), pack: int, lane: int, start: int, end: int, width: int):
+        """The same of integers."""
+        for row in range(width):
+            array[pack, width * end + row, lane] = array[pack, width * start + row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
-    def solve(
-        rows: int,
-        order: int,
-        # Workspace in
-        count_in: wp.array3d(dtype=wp.int32),
-        delassus_in: wp.array3d(dtype=real),
-        compliance_in: wp.array3d(dtype=real),
-        softness_in: wp.array3d(dtype=real),
-        active_in: wp.array3d(dtype=wp.int32),
-        mode_in: wp.array3d(dtype=real),
-        mu_in: wp.array3d(dtype=real),
-        gap_in: wp.array3d(dtype=real),
-        offset_in: wp.array3d(dtype=real),
+    def drop_open(
+        normal_rows: int,
         # Workspace out
-        matrix_out: wp.array3d(dtype=real),
-        change_out: wp.array3d(dtype=real),
-        q_out: wp.array3d(dtype=real),
-        z_out: wp.array3d(dtype=real),
-        unsure_out: wp.array3d(dtype=wp.int32),
+        count_out: wp.array3d(dtype=wp.int32),
+        listed_out: wp.array3d(dtype=wp.int32),
+        key_out: wp.array3d(dtype=wp.int32),
+        pair_out: wp.array3d(dtype=wp.int32),
+        dof_out: wp.array3d(dtype=wp.int32),
+        couple_out: wp.array3d(dtype=wp.int32),
+        face_out: wp.array3d(dtype=wp.int32),
+        look_out: wp.array3d(dtype=wp.int32),
+        weight_out: wp.array3d(dtype=real),
+        lever_out: wp.array3d(dtype=real),
+        axes_out: wp.array3d(dtype=real),
+        gap_out: wp.array3d(dtype=real),
+        mu_out: wp.array3d(dtype=real),
+        restitution_out: wp.array3d(dtype=real),
+        softness_out: wp.array3d(dtype=real),
+        multiplier_out: wp.array3d(dtype=real),
+        first_force_out: wp.array3d(dtype=real),
+        normal_out: wp.array3d(dtype=real),
     ):
-        """Changes of q and z, and their sums, by Gauss' elimination; rows that repeat others get none.
+        """Leave out the contacts of one world that pushed in no solution, as nothing has a gradient by them.
 
-        Where equations that repeat others contradict them, as contacts that slip and share a load in many ways with
-        other friction may, nothing solves them: ``unsure``.
+        Others keep their order; places that become free are neutral. Arrays may be the same.
         """
         pack, lane = wp.tid()
-        total = rows + 3 * count_in[pack, 0, lane]
-        for i in range(total):
-            equation(
-                delassus_in,
-                compliance_in,
-                softness_in,
-                active_in,
-                mode_in,
-                mu_in,
-                gap_in,
-                offset_in,
-                q_out,
-                z_out,
-                pack,
-                lane,
-                rows,
-                order,
-                total,
-                i,
-                True,
-                pack,
-                lane,
-                matrix_out,
-                change_out,
-            )
-        scale = real(0.0)
-        for i in range(total):
-            known = real(0.0)
-            if i >= rows:
-                known = delassus_in[pack, i * order + i, lane] * z_out[pack, i - rows, lane]
-            largest_entry = real(0.0)
-            for j in range(total):
-                entry_in_units = matrix_out[pack, i * order + j, lane] * unit_of(delassus_in, pack, lane, order, j)
-                matrix_out[pack, i * order + j, lane] = entry_in_units
-                largest_entry = wp.max(largest_entry, wp.abs(entry_in_units))
-            if largest_entry > real(0.0):
-                for j in range(total):
-                    matrix_out[pack, i * order + j, lane] = matrix_out[pack, i * order + j, lane] / largest_entry
-                change_out[pack, i, lane] = change_out[pack, i, lane] / largest_entry
-                known = known / largest_entry
-            scale = wp.max(scale, wp.max(wp.abs(change_out[pack, i, lane]), wp.abs(known)))
-        rank = int(0)  # rows that have a pivot, each in its column; a column without one repeats those before it
-        for k in range(total):
-            largest = int(rank)
-            for i in range(rank + 1, total):
-                if wp.abs(matrix_out[pack, i * order + k, lane]) > wp.abs(matrix_out[pack, largest * order + k, lane]):
-                    largest = i
-            pivot = matrix_out[pack, largest * order + k, lane]
-            if wp.abs(pivot) > real(wp.static(dependent)):
-                if largest != rank:
-                    swap(matrix_out, change_out, pack, lane, order, total, largest, rank, k)
-                for i in range(rank + 1, total):
-                    entry = matrix_out[pack, i * order + k, lane]
-                    if entry != real(0.0):
-                        factor = entry / pivot
-                        for j in range(k + 1, total):
-                            from_pivot = factor * matrix_out[pack, rank * order + j, lane]
-                            matrix_out[pack, i * order + j, lane] = matrix_out[pack, i * order + j, lane] - from_pivot
-                        change_out[pack, i, lane] = change_out[pack, i, lane] - factor * change_out[pack, rank, lane]
-                if rank < k:
-                    matrix_out[pack, k * order + k, lane] = real(1.0)  # nobody reads what is below a pivot
-                rank += 1
-            else:
-                matrix_out[pack, k * order + k, lane] = real(0.0)
-        for i in range(rank, total):  # 0 = 0, or there is no solution
-            if wp.abs(change_out[pack, i, lane]) > real(wp.static(unsolved)) * scale:
-                unsure_out[pack, 0, lane] = 1
-        for back in range(total):
-            i = total - 1 - back
-            value = real(0.0)
-            if matrix_out[pack, i * order + i, lane] != real(0.0):
-                rank -= 1
-                value = change_out[pack, rank, lane]
-                for j in range(i + 1, total):
-                    value -= matrix_out[pack, rank * order + j, lane] * change_out[pack, j, lane]
-                value = value / matrix_out[pack, rank * order + i, lane]
-            change_out[pack, i, lane] = value
-        for i in range(total):
-            value = change_out[pack, i, lane] * unit_of(delassus_in, pack, lane, order, i)
-            change_out[pack, i, lane] = value
-            if i < rows:
-                q_out[pack, i, lane] = q_out[pack, i, lane] + value
-            else:
-                z_out[pack, i - rows, lane] = z_out[pack, i - rows, lane] + value
-        for i in range(total, order):
-            change_out[pack, i, lane] = real(0.0)
+        kept = int(0)
+        listed = int(0)
+        count = count_out[pack, 0, lane]
+        for contact in range(count):
+            pushes = multiplier_out[pack, 3 * contact, lane] > real(0.0)
+            if pushes or first_force_out[pack, 3 * contact, lane] > real(0.0):
+                if kept < contact:
+                    shift_integers(key_out, pack, lane, contact, kept, 1)
+                    shift_integers(pair_out, pack, lane, contact, kept, 1)
+                    shift_integers(dof_out, pack, lane, contact, kept, wp.static(SLOTS))
+                    shift_integers(couple_out, pack, lane, contact, kept, 1)
+                    shift_integers(face_out, pack, lane, contact, kept, 1)
+                    shift_integers(look_out, pack, lane, contact, kept, 1)
+                    shift(weight_out, pack, lane, contact, kept, wp.static(SLOTS))
+                    shift(lever_out, pack, lane, contact, kept, wp.static(3 * SLOTS))
+                    shift(axes_out, pack, lane, contact, kept, 9)
+                    shift(gap_out, pack, lane, contact, kept, 1)
+                    shift(mu_out, pack, lane, contact, kept, 1)
+                    shift(restitution_out, pack, lane, contact, kept, 1)
+                    shift(softness_out, pack, lane, contact, kept, 1)
+                    shift(multiplier_out, pack, lane, contact, kept, 3)
+                    shift(first_force_out, pack, lane, contact, kept, 3)
+                    shift(normal_out, pack, lane, contact, kept, normal_rows)
+                kept += 1
+                if contact < listed_out[pack, 0, lane]:
+                    listed += 1
+        for contact in range(kept, count):
+            gap_out[pack, contact, lane] = real(1.0)
+            mu_out[pack, contact, lane] = real(0.0)
+            for row in range(wp.static(SLOTS)):
+                dof_out[pack, wp.static(SLOTS) * contact + row, lane] = -1
+                weight_out[pack, wp.static(SLOTS) * contact + row, lane] = real(0.0)
+            for row in range(wp.static(3 * SLOTS)):
+                lever_out[pack, wp.static(3 * SLOTS) * contact + row, lane] = real(0.0)
+            for row in range(9):
+                axes_out[pack, 9 * contact + row, lane] = real(0.0)
+            for row in range(3):
+                multiplier_out[pack, 3 * contact + row, lane] = real(0.0)
+                first_force_out[pack, 3 * contact + row, lane] = real(0.0)
+        count_out[pack, 0, lane] = kept
+        listed_out[pack, 0, lane] = listed
 
-    result = SimpleNamespace(known_gaps=known_gaps, modes=modes, solve=solve)
-    if variant.world_fastest:
-        return result
-    factor, eliminate = elimination.functions(real).factor, elimination.functions(real).solve
-
-    @wp.kernel(module=module, enable_backward=False)
-    def solve_again(
-        rows: int,
-        order: int,
-        is_new: bool,
-        # Workspace in
-        count_in: wp.array3d(dtype=wp.int32),
-        delassus_in: wp.array3d(dtype=real),
-        compliance_in: wp.array3d(dtype=real),
-        softness_in: wp.array3d(dtype=real),
-        active_in: wp.array3d(dtype=wp.int32),
-        mode_in: wp.array3d(dtype=real),
-        mu_in: wp.array3d(dtype=real),
-        gap_in: wp.array3d(dtype=real),
-        offset_in: wp.array3d(dtype=real),
-        # Workspace out
-        matrix_out: wp.array3d(dtype=real),
-        held_out: wp.array3d(dtype=real),
-        change_out: wp.array3d(dtype=real),
-        q_out: wp.array3d(dtype=real),
-        z_out: wp.array3d(dtype=real),
-        unsure_out: wp.array3d(dtype=wp.int32),
-    ):
-        """``solve`` on a CPU, where factors of a matrix that is not new serve again."""
-        pack, lane = wp.tid()
-        world = pack * gap_in.shape[2] + lane
-        total = rows + 3 * count_in[pack, 0, lane]
-        for i in range(total):
-            equation(
-                delassus_in,
-                compliance_in,
-                softness_in,
-                active_in,
-                mode_in,
-                mu_in,
-                gap_in,
-                offset_in,
-                q_out,
-                z_out,
-                pack,
-                lane,
-                rows,
-                order,
-                total,
-                i,
-                is_new,
-                world,
-                0,
-                matrix_out,
-                change_out,
-            )
-            if is_new:
-                held_out[world, i, 0] = unit_of(delassus_in, pack, lane, order, i)
-        if is_new:
-            factor(matrix_out, held_out, world, order, total, real(wp.static(dependent)))
-        scale = real(0.0)
-        for i in range(total):
-            known = real(0.0)
-            if i >= rows:
-                known = delassus_in[pack, i * order + i, lane] * z_out[pack, i - rows, lane]
-            right = change_out[pack, i, lane]
-            largest = held_out[world, order + i, 0]
-            if largest > real(0.0):
-                right = right / largest
-                known = known / largest
-            held_out[world, 2 * order + i, 0] = right
-            scale = wp.max(scale, wp.max(wp.abs(right), wp.abs(known)))
-        if eliminate(matrix_out, held_out, world, order, total, real(wp.static(unsolved)) * scale) != 0:
-            unsure_out[pack, 0, lane] = 1
-        for i in range(total):
-            value = held_out[world, 2 * order + i, 0] * held_out[world, i, 0]
-            change_out[pack, i, lane] = value
-            if i < rows:
-                q_out[pack, i, lane] = q_out[pack, i, lane] + value
-            else:
-                z_out[pack, i - rows, lane] = z_out[pack, i - rows, lane] + value
-        for i in range(total, order):
-            change_out[pack, i, lane] = real(0.0)
-
-    return SimpleNamespace(**vars(result), solve_again=solve_again)
+    return SimpleNamespace(known_gaps=known_gaps, modes=modes, drop_open=drop_open)

@@ -181,6 +181,23 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for row in range(first, last):
                 bar_out[world, row] = total_in[world, row] + bar_out[world, row]
 
+    @wp.kernel(module=module, enable_backward=False)
+    def take_listed(
+        lanes: int,
+        # Model
+        node: wp.array(dtype=wp.int32),
+        # State
+        total_in: wp.array2d(dtype=real),
+        # Workspace out
+        listed_out: wp.array3d(dtype=real),
+    ):
+        """Add what the gradient by one listed node was before."""
+        pack, item, lane = wp.tid()
+        world = pack * lanes + lane
+        if world < total_in.shape[0]:
+            for c in range(3):
+                listed_out[pack, 3 * item + c, lane] += total_in[world, 3 * node[item] + c]
+
     return SimpleNamespace(
         looks=looks,
         any_look=any_look,
@@ -188,4 +205,5 @@ def kernels(variant: Variant) -> SimpleNamespace:
         first_forces=first_forces,
         hand_over=hand_over,
         take_back=take_back,
+        take_listed=take_listed,
     )

@@ -23,7 +23,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("state")
     of_packs = packs.functions(real)
     are_finite, are_near, interleave_rows = of_packs.are_finite, of_packs.are_near, of_packs.interleave_rows
-    add_numbers = of_packs.add_numbers
+    add_numbers, copy_numbers = of_packs.add_numbers, of_packs.copy_numbers
 
     @wp.kernel(module=module, enable_backward=False)
     def interleave(
@@ -49,14 +49,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def place_rows(
         first: int,
+        count: int,
         # Workspace in
         value_in: wp.array3d(dtype=real),
         # Workspace out
         target_out: wp.array3d(dtype=real),
     ):
-        """Copy one row to the rows from ``first`` on; a graph cannot hold copies between parts of arrays."""
-        pack, row, lane = wp.tid()
-        target_out[pack, first + row, lane] = value_in[pack, row, lane]
+        """Copy ``count`` rows to the rows from ``first`` on; a graph cannot hold copies between parts of arrays.
+
+        On a CPU a thread has its share of a pack's numbers.
+        """
+        pack, part, lane = wp.tid()
+        if wp.static(world_fastest):
+            target_out[pack, first + part, lane] = value_in[pack, part, lane]
+        else:
+            lanes = value_in.shape[2]
+            copy_numbers(value_in, target_out, pack, first * lanes, lane * count, (lane + 1) * count)
 
     @wp.kernel(module=module, enable_backward=False)
     def add_rows(

@@ -94,6 +94,7 @@ class Detector:
     Attributes:
         contacts: The list that ``find`` fills.
         key_count: Contacts that could exist at the same time.
+        point_nodes: Nodes that are points of the scene themselves, besides those that carry embedded points.
     """
 
     def __init__(
@@ -166,7 +167,9 @@ class Detector:
         self.carrier = wp.array(carrier, dtype=wp.int32, device=self.device)
         self.carrier_weight = wp.array(weight, dtype=self.variant.real, device=self.device)
         of_nodes = scene.points.array("kind", np.int32) == Carrier.NODE
-        seen = np.unique(np.concatenate([carrier.ravel(), scene.points.array("index", np.int32)[of_nodes]]))
+        index = scene.points.array("index", np.int32)[of_nodes]
+        self.point_nodes = np.unique(index[index < self.node_total])
+        seen = np.unique(np.concatenate([carrier.ravel(), index]))
         nodes = seen[(seen >= 0) & (seen < self.node_total)]
         points = self.node_total + np.arange(self.embedded_count)
         self.followed = wp.array(np.concatenate([nodes, points]), dtype=wp.int32, device=self.device)

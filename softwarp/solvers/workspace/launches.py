@@ -58,7 +58,8 @@ class Launches:
 
     def place(self, value: Rows, count: int, target: Rows, first: int) -> None:
         """Copy ``count`` rows to those of ``target`` from ``first`` on."""
-        self.each_real(self.k_state.place_rows, count, [first, value.real], [target.real])
+        parts = self.variant.parts(count)
+        self.each_real(self.k_state.place_rows, parts, [first, count, value.real], [target.real])
 
     def add(self, value: Rows, target: Rows, count: int) -> None:
         """Add the first ``count`` rows to those of ``target``."""
