@@ -9,6 +9,7 @@ from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.finger_geometry import FingerMesh, finger
+from softwarp.meshing.hexes import HexMesh, brick, check_hexes
 from softwarp.meshing.lumen import Lumen
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.nasal_geometry import nasal_passage
@@ -56,6 +57,7 @@ __all__ = [
     "CavityWall",
     "CupMesh",
     "FingerMesh",
+    "HexMesh",
     "Lumen",
     "Maze",
     "MembraneGeometry",
@@ -73,7 +75,9 @@ __all__ = [
     "as_surface",
     "board",
     "box",
+    "brick",
     "check_closed",
+    "check_hexes",
     "check_tets",
     "compact",
     "cup",

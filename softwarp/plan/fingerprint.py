@@ -93,7 +93,7 @@ FRAMES = {
     "carried_slot": INT,
 }
 SURFACE = {"points": FLOAT, "triangles": INT, "node": INT, "weight": FLOAT}
-NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "symbolic")  # records hashed by name
+NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "hexes", "symbolic")  # records hashed by name
 SEGMENTS = {"seg_length": FLOAT, "seg_section": FLOAT, "seg_scale": FLOAT, "seg_rest": FLOAT}
 
 
@@ -108,6 +108,9 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
     add(model, SOFT)
     if model.quadratic is not None:
         add(model.quadratic, {"nodes": INT})
+    if model.hexes is not None:
+        digest.update(b"hexes")
+        add(model.hexes, {"nodes": INT})
     for body in scene.bodies:
         if body.stiffness is not None:
             digest.update(body.stiffness.tobytes())

@@ -58,7 +58,7 @@ LAYERS = (
     ("diagnostics", "growth"),
     ("modal", "reactions", "static_advice", "stresses"),
     ("measures", "snapshot", "statics"),
-    ("telescopes", "tendons"),
+    ("bricks", "telescopes", "tendons"),
     ("builder", "simulation"),
     ("gradients",),
     ("identification", "io", "reduction"),

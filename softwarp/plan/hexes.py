@@ -1,0 +1,184 @@
+"""From hexahedra of a scene to their arrays. Host only. Theory: docs/theory/hexahedral.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softwarp.meshing.hexes import CORNERS, SIGNS, node_volumes, shape_gradients, split
+from softwarp.meshing.tets import tet_volumes
+from softwarp.model.hexes import HexLayout, HexModel
+from softwarp.plan.structure import Elements, Structure
+from softwarp.scene.parts import Scene
+
+IntArray = NDArray[np.int32]
+FloatArray = NDArray[np.float64]
+SAME = 1e-11  # of the longest edge: hexahedra that differ by less share a shape
+MODES = 9
+PAIRS = [(a, b) for a in range(CORNERS) for b in range(a + 1)]
+
+
+def hex_layout(scene: Scene, node_start: IntArray) -> HexLayout:
+    """Number the hexahedra body after body."""
+    found = [(i, b, b.hexes) for i, b in enumerate(scene.bodies) if b.hexes is not None]
+    nodes, lumped = [np.empty((0, CORNERS), dtype=np.int32)], [np.empty((0, CORNERS))]
+    factor = [np.empty(0)]
+    for i, spec, hexes in found:
+        nodes.append(hexes + node_start[i])
+        volumes = node_volumes(spec.mesh.nodes, hexes)
+        if spec.lumping == "uniform":
+            counts = np.bincount(hexes.ravel(), minlength=len(spec.mesh.nodes))
+            volumes = (volumes.sum() / len(spec.mesh.nodes) / counts)[hexes]
+        lumped.append(volumes)
+        factor.append(np.ones(len(hexes)) if spec.stiffness is None else spec.stiffness)
+    return HexLayout(
+        nodes=np.concatenate(nodes).astype(np.int32),
+        body=np.repeat([i for i, _, _ in found], [len(part) for part in nodes[1:]]).astype(np.int32),
+        lumped=np.concatenate(lumped),
+        factor=np.concatenate(factor),
+    )
+
+
+def hex_elements(layout: HexLayout) -> list[Elements]:
+    """Hexahedra as elements; nothing without any."""
+    return [Elements("hex", layout.nodes, np.arange(len(layout.nodes)))] if len(layout.nodes) else []
+
+
+def hex_model(layout: HexLayout, nodes: FloatArray, found: Structure) -> HexModel | None:
+    """Hexahedra and their shapes; None without any."""
+    if len(layout.nodes) == 0:
+        return None
+    x = own_corners(nodes[layout.nodes])
+    grid = SAME * np.abs(x).max()
+    keys = np.column_stack([layout.body, np.round(x.reshape(len(x), -1) / grid)])
+    _, first, shape = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    pieces = split(layout.nodes)
+    return HexModel(
+        layout=layout,
+        hex_node=layout.nodes,
+        hex_body=layout.body,
+        hex_shape=shape.reshape(-1).astype(np.int32),
+        hex_factor=layout.factor,
+        shape_body=layout.body[first],
+        piece_node=pieces,
+        piece_size=tet_volumes(nodes, pieces),
+        **vars(shape_arrays(x[first])),
+        **vars(hex_lists(found)),
+    )
+
+
+@dataclass(frozen=True)
+class HexLists:
+    """Where blocks and forces go, under the names that ``HexModel`` declares."""
+
+    entry_start: IntArray
+    entry: IntArray
+    carried_block: IntArray
+    carried_start: IntArray
+    carried_entry: IntArray
+    held_node: IntArray
+    held_start: IntArray
+    held_entry: IntArray
+
+
+def hex_lists(found: Structure) -> HexLists:
+    """Lists of the structure of A."""
+    kept = found.lists["hex"]
+    return HexLists(
+        entry_start=kept.start,
+        entry=kept.entry,
+        carried_block=kept.carried.target,
+        carried_start=kept.carried.start,
+        carried_entry=kept.carried.entry,
+        held_node=kept.held.target,
+        held_start=kept.held.start,
+        held_entry=kept.held.entry,
+    )
+
+
+def own_corners(x: FloatArray) -> FloatArray:
+    """Corners of hexahedra (hex, 8, 3) from the first, in axes of their own: along xi at the centre, and near eta."""
+    edges = np.einsum("nac,ak->nkc", x, SIGNS / 8.0)  # rows dx/dxi_k
+    e1 = edges[:, 0] / np.linalg.norm(edges[:, 0], axis=1, keepdims=True)
+    e3 = np.cross(e1, edges[:, 1])
+    e3 /= np.linalg.norm(e3, axis=1, keepdims=True)
+    axes = np.stack([e1, np.cross(e3, e1), e3], axis=1)
+    return np.asarray(np.einsum("nkc,nac->nak", axes, x - x[:, :1]))
+
+
+@dataclass(frozen=True)
+class ShapeArrays:
+    """Shapes, under the names that ``HexModel`` declares."""
+
+    shape_x: FloatArray
+    shape_gradient: FloatArray
+    shape_volume: FloatArray
+    shape_mu: FloatArray
+    shape_lam: FloatArray
+    mode_mu: FloatArray
+    mode_lam: FloatArray
+    mode_ratio: FloatArray
+
+
+def shape_arrays(x: FloatArray) -> ShapeArrays:
+    """Stiffness per Lame constant of corners and incompatible modes, for shapes with the corners ``x`` (shape, 8, 3).
+
+    With K_uu, K_ui and K_ii linear in mu and lam, modes p that make p' K_ii p = mu + lam s diagonal leave
+
+        K = K_uu - sum over modes of (mu a + lam b) (mu a + lam b)' / (mu + lam s).
+    """
+    count, corners = len(x), CORNERS + 3
+    products = np.zeros((count, corners, corners, 3, 3))  # integrals of grad N_a grad N_b'
+    gradient, volume = np.zeros((count, CORNERS, 3)), np.zeros(count)
+    centre = x.transpose(0, 2, 1) @ shape_gradients(np.zeros(3))
+    for point in SIGNS / np.sqrt(3.0):
+        natural = shape_gradients(point)
+        jacobian = x.transpose(0, 2, 1) @ natural
+        weight = np.linalg.det(jacobian)
+        g = np.zeros((count, corners, 3))
+        g[:, :CORNERS] = natural @ np.linalg.inv(jacobian)
+        # modes 1 - xi_k^2; their gradients have the mean 0 with the Jacobian of the centre (Taylor et al. 1976)
+        ratio = np.linalg.det(centre) / weight
+        g[:, CORNERS:] = ratio[:, None, None] * (np.diag(-2.0 * point) @ np.linalg.inv(centre))
+        products += weight[:, None, None, None, None] * g[:, :, None, :, None] * g[:, None, :, None, :]
+        gradient += weight[:, None, None] * g[:, :CORNERS]
+        volume += weight
+    trace = np.einsum("nabcc->nab", products)
+    per_mu = products.swapaxes(3, 4) + trace[..., None, None] * np.eye(3)
+    mu, lam = (part.swapaxes(2, 3).reshape(count, 3 * corners, 3 * corners) for part in (per_mu, products))
+    end = 3 * CORNERS
+    root = np.linalg.inv(np.linalg.cholesky(mu[:, end:, end:]))
+    ratio, turned = np.linalg.eigh(root @ lam[:, end:, end:] @ root.swapaxes(1, 2))
+    modes = root.swapaxes(1, 2) @ turned
+    return ShapeArrays(
+        shape_x=x.reshape(count, -1),
+        shape_gradient=(gradient / volume[:, None, None]).reshape(count, -1),
+        shape_volume=volume,
+        shape_mu=_blocks(mu),
+        shape_lam=_blocks(lam),
+        mode_mu=(mu[:, :end, end:] @ modes).swapaxes(1, 2).reshape(count, -1),
+        mode_lam=(lam[:, :end, end:] @ modes).swapaxes(1, 2).reshape(count, -1),
+        mode_ratio=ratio,
+    )
+
+
+def stiffness(arrays: ShapeArrays, mu: float, lam: float) -> FloatArray:
+    """K of shapes with incompatible modes [N/m], (shape, 24, 24)."""
+    blocks = mu * arrays.shape_mu + lam * arrays.shape_lam
+    result = np.zeros((len(blocks), CORNERS, 3, CORNERS, 3))
+    for (a, b), block in zip(PAIRS, np.moveaxis(blocks.reshape(len(blocks), -1, 3, 3), 1, 0), strict=True):
+        result[:, a, :, b] = block
+        result[:, b, :, a] = block.swapaxes(1, 2)
+    modes = (mu * arrays.mode_mu + lam * arrays.mode_lam).reshape(len(blocks), MODES, -1)
+    weighted = modes / (mu + lam * arrays.mode_ratio)[..., None]
+    size = 3 * CORNERS
+    return np.asarray(result.reshape(-1, size, size) - modes.swapaxes(1, 2) @ weighted)
+
+
+def _blocks(matrix: NDArray[Any]) -> FloatArray:
+    """Blocks (a, b), a >= b, of the corners, row by row, (shape, 324)."""
+    parts = [matrix[:, 3 * a : 3 * a + 3, 3 * b : 3 * b + 3].reshape(len(matrix), 9) for a, b in PAIRS]
+    return np.concatenate(parts, axis=1)
