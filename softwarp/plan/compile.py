@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,6 +246,6 @@ def coupled(model: Model) -> Model:
         quadratic = replace(quadratic, **vars(entry_lists(found)), **vars(inertia))
     if hexes is not None:
         hexes = replace(hexes, **vars(hex_lists(found)))
-    parts = {"quadratic": quadratic, "hexes": hexes, "cavities": chambers}
+    parts: dict[str, Any] = {"quadratic": quadratic, "hexes": hexes, "cavities": chambers}
     other = replace(model, symbolic=found.symbolic, **parts, **found.model_arrays())
     return upload(other, model.device, real_of(model.precision))

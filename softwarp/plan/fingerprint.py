@@ -93,7 +93,8 @@ FRAMES = {
     "carried_slot": INT,
 }
 SURFACE = {"points": FLOAT, "triangles": INT, "node": INT, "weight": FLOAT}
-NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "hexes", "symbolic")  # records hashed by name
+# Records hashed by name
+NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "hexes", "symbolic")
 SEGMENTS = {"seg_length": FLOAT, "seg_section": FLOAT, "seg_scale": FLOAT, "seg_rest": FLOAT}
 
 

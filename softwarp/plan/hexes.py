@@ -62,6 +62,7 @@ def hex_model(layout: HexLayout, nodes: FloatArray, found: Structure) -> HexMode
         hex_body=layout.body,
         hex_shape=shape.reshape(-1).astype(np.int32),
         hex_factor=layout.factor,
+        hex_volume=node_volumes(nodes, layout.nodes).sum(axis=1),
         shape_body=layout.body[first],
         piece_node=pieces,
         piece_size=tet_volumes(nodes, pieces),
@@ -115,7 +116,6 @@ class ShapeArrays:
 
     shape_x: FloatArray
     shape_gradient: FloatArray
-    shape_volume: FloatArray
     shape_mu: FloatArray
     shape_lam: FloatArray
     mode_mu: FloatArray
@@ -156,7 +156,6 @@ def shape_arrays(x: FloatArray) -> ShapeArrays:
     return ShapeArrays(
         shape_x=x.reshape(count, -1),
         shape_gradient=(gradient / volume[:, None, None]).reshape(count, -1),
-        shape_volume=volume,
         shape_mu=_blocks(mu),
         shape_lam=_blocks(lam),
         mode_mu=(mu[:, :end, end:] @ modes).swapaxes(1, 2).reshape(count, -1),

@@ -50,7 +50,13 @@ def add_tets(
     value = _density(density, total_mass, material, (quadratic or mesh).volume, label)
     if quadratic is not None and lumping != "volume":
         raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
-    given = {"mesh": mesh, "material": material, "density": value, "lumping": lumping, "rayleigh": damping}
+    given: dict[str, Any] = {
+        "mesh": mesh,
+        "material": material,
+        "density": value,
+        "lumping": lumping,
+        "rayleigh": damping,
+    }
     given["relaxation"] = _relaxation(relaxation, label)
     given["elements"] = None if quadratic is None else quadratic.elements
     if stiffness is not None:
@@ -89,7 +95,13 @@ def add_hexes(
             "tetrahedra: add_tets(mesh.linear(), ...)"
         )
     value = _density(density, total_mass, material, nodes.volume, label)
-    given = {"mesh": nodes.linear(), "hexes": nodes.hexes, "material": material, "density": value, "lumping": lumping}
+    given: dict[str, Any] = {
+        "mesh": nodes.linear(),
+        "hexes": nodes.hexes,
+        "material": material,
+        "density": value,
+        "lumping": lumping,
+    }
     if stiffness is not None:
         given["stiffness"] = _stiffness(stiffness, len(nodes.hexes), label)
     return _append(scene, label, contact_surface, rayleigh=damping, relaxation=(0.0, 0.0), **given)
@@ -112,9 +124,7 @@ def _append(scene: Scene, label: str, contact_surface: Any, *, mesh: meshing.Tet
     return SoftBody(len(scene.bodies) - 1)
 
 
-def _density(
-    density: float | None, total_mass: float | None, material: Material, volume: float, label: str
-) -> float:
+def _density(density: float | None, total_mass: float | None, material: Material, volume: float, label: str) -> float:
     """Density of a body of some volume [m^3] that is given its density or its mass."""
     if density is None and total_mass is None:
         density = material.density

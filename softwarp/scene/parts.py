@@ -71,7 +71,7 @@ class BodySpec:
     elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
     hexes: IntArray | None = None  # (m, 8) hexahedra; the mesh then has the linear tets between their nodes
     contact_surface: ContactSurface | None = None  # what touches; None for the boundary of the mesh
-    stiffness: FloatArray | None = None  # factors of the modulus, (m,) of linear tets or hexes, (m, 4) of quadratic points
+    stiffness: FloatArray | None = None  # factors of the modulus, (m,) of elements, (m, 4) of quadratic ones' points
     reduction: ReductionSpec | None = None  # modes that it moves in; None for node by node
     points: PointTets | None = None  # what stands for the elements of a reduced body once it is planned
 

@@ -80,7 +80,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     mul, div, any_positive, select = variant.mul, variant.div, variant.any_positive, variant.select
     module = variant.module("hexahedral")
     a, f = algebra(variant), functions(variant)
-    Vector, Matrix, Symmetric, vector, rows = a.Vector, a.Matrix, a.Symmetric, a.vector, a.rows
+    Vector, Matrix, Symmetric, rows = a.Vector, a.Matrix, a.Symmetric, a.rows
     row_x, row_y, row_z, transposed, matmul, crossmul = a.row_x, a.row_y, a.row_z, a.transposed, a.matmul, a.crossmul
     add, subtract, scaled, cross, matvec, apply = a.add, a.subtract, a.scaled, a.cross, a.matvec, a.apply
     read_vector, write_vector, add_vector, constant = a.read_vector, a.write_vector, a.add_vector, a.constant

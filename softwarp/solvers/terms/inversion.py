@@ -11,7 +11,7 @@ from softwarp.solvers.workspace.shard import Shard
 
 
 class InversionTerm(Term):
-    """Volume ratios of linear tetrahedra, of quadratic ones at their Gauss points and of the pieces of hexahedra, where a step has led to."""
+    """Volume ratios where a step has led to: of linear tets, Gauss points of quadratic ones, pieces of hexahedra."""
 
     follows_paths = has_exact_tangent = True
 

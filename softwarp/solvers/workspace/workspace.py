@@ -96,7 +96,7 @@ class Workspace:
     grip: Rows = scratch("grip", grip.ROWS, doc="sums of these and of their moments over nodes that a frame carries")
     gauss_stiffness: Rows = scratch("stored Gauss point", 90, unit="N/m", doc="ten blocks of its linear tet")
     hex_moduli: Rows = scratch("hex shape", 2, unit="Pa", doc="Lame constants of hex_stiffness")
-    hex_stiffness: Rows = scratch("hex shape", hexahedral.STORED_ROWS, unit="N/m", doc="36 blocks K_ab, a >= b, at rest")
+    hex_stiffness: Rows = scratch("hex shape", hexahedral.STORED_ROWS, unit="N/m", doc="36 blocks K_ab, a >= b")
     hex_rotation: Rows = scratch("hex", 9, doc="rotation Q from the axes of the shape")
     hex_strain: Rows = scratch("hex", 24, unit="m", doc="displacements of corners in these axes, from the first")
     segment_force: Rows = scratch("segment", 12, unit="N", doc="force and moment [N m] of a rod segment on its ends")
@@ -301,7 +301,8 @@ def counts(model: Model, exact: bool) -> dict[str, int]:
         "body": model.body_count + model.rod_count + model.rigid_count,
         "dof": model.dof_room,
         "block": len(model.symbolic.a_row),
-        "element force": 12 * (model.tet_count + triangles) + 3 * quadratic.NODES * model.quadratic_count
+        "element force": 12 * (model.tet_count + triangles)
+        + 3 * quadratic.NODES * model.quadratic_count
         + 3 * hexahedral.CORNERS * model.hex_count,
         "hex": model.hex_count,
         "hex shape": 0 if model.hexes is None else int(model.hexes.shape_body.size),
