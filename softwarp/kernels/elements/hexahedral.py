@@ -20,7 +20,6 @@ from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import attachment, corotational, warped
 
 CORNERS = 8
-MODES = 9
 STORED_ROWS = 324  # of a shape: 36 blocks K_ab, a >= b
 ITERATIONS = warped.ITERATIONS
 SAME = 1.0e-37  # Pa^2, square of a difference between moduli that are equal
