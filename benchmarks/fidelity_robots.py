@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from softwarp.envs.options.trunk import TrunkSceneConfig
 from softwarp.envs.scenes.catch_the_object import add_pad, build_catch_scene
 from softwarp.envs.scenes.diamond import EFFECTOR, build_diamond_scene, diamond_mesh
 from softwarp.envs.scenes.gripper import build_gripper_scene
-from softwarp.envs.scenes.tripod import HEIGHT, SERVOS, build_tripod_scene, tripod_mesh, turn
+from softwarp.envs.scenes.tripod import HEIGHT, SERVOS, build_tripod_scene, tripod_mesh, tripod_walls, turn
 from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
 from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.finger_geometry import FLANGE
@@ -81,7 +81,7 @@ def weighed(
     """Where a point of a solid rests under gravity [m/s^2], in float64, (case, 3), and where it is without.
 
     Args:
-        mesh: Nodes and linear elements.
+        mesh: Nodes and linear elements, or hexahedra of walls.
         config: Has ``youngs``, ``nu``, ``rotation`` and ``element``, perhaps ``lumping``.
         mass: Of the solid [kg].
         held: Which of places (node, 3) are held.
@@ -90,14 +90,13 @@ def weighed(
         stiffness: Factors of the modulus.
     """
     builder = softwarp.ModelBuilder()
-    body = builder.add_tets(
-        mesh,
-        material=softwarp.Corotational(config.youngs, config.nu, method=config.rotation),
-        element=config.element,
-        total_mass=mass,
-        lumping=cast("Any", getattr(config, "lumping", "volume") if config.element == "p1" else "volume"),
-        stiffness=stiffness,
-    )
+    law = softwarp.Corotational(config.youngs, config.nu, method=config.rotation)
+    given: dict[str, Any] = {"material": law, "total_mass": mass, "stiffness": stiffness}
+    if isinstance(mesh, meshing.HexMesh):
+        body = builder.add_hexes(mesh, thin=True, **given)
+    else:
+        lumping = getattr(config, "lumping", "volume") if config.element == "p1" else "volume"
+        body = builder.add_tets(mesh, element=config.element, lumping=lumping, **given)
     builder.fix(body, nodes=np.flatnonzero(held(builder.bodies[body].mesh.nodes)))
     builder.add_marker(body, tuple(point), tolerance=0.006)
     sim = softwarp.Simulation(builder.finalize(len(gravity), "cpu", "float64"))
@@ -139,7 +138,8 @@ def hang_tripod(mesh: Any, config: TripodSceneConfig, loads: Sequence[Sequence[f
 
 def _tripod(options: Options) -> tuple[Floats, Floats]:
     config = TripodSceneConfig(**options)
-    return hang_tripod(tripod_mesh(config), config, TRIPOD_LOADS)
+    mesh = tripod_walls(config) if config.element == "walls" else tripod_mesh(config)
+    return hang_tripod(mesh, config, TRIPOD_LOADS)
 
 
 def _finger(options: Options) -> tuple[Floats, Floats]:
@@ -212,7 +212,7 @@ ROBOTS = {
         lambda options, builder: build_tripod_scene(TripodSceneConfig(**options), builder),
         _tripod,
         TRIPOD_WAYS,
-        {"default": {}, "fine": {"mesh": "fine", **WARPED, "lumping": "volume"}, "p2": SOLID},
+        {"default": {}, "fine": {"mesh": "fine", **WARPED, "lumping": "volume"}, "p2": SOLID, "accurate": {"fidelity": "accurate"}},
     ),
     "CatchTheObject": Robot(
         lambda options, builder: build_catch_scene(CatchSceneConfig(**options), builder),

@@ -30,6 +30,7 @@ class Bricks:
         rayleigh: tuple[float, float] = (0.0, 0.0),
         stiffness: ArrayLike | None = None,
         contact_surface: Any = None,
+        thin: bool = False,
         name: str | None = None,
     ) -> SoftBody:
         """Add a soft body of hexahedra with incompatible modes, which bend and do not lock near nu = 0.5.
@@ -51,6 +52,8 @@ class Bricks:
             rayleigh: Damping factors (mass [1/s], stiffness [s]).
             stiffness: Factors of the modulus, positive, one an element, (m,).
             contact_surface: As for ``add_tets``.
+            thin: Whether elements are the whole thickness of a wall, from its lower to its upper face: six more modes
+                then let them bend under moments that change along them, and coarser ones do.
             name: For messages and exports.
 
         Returns:
@@ -62,4 +65,4 @@ class Bricks:
         """
         options: dict[str, Any] = {"material": material, "density": density, "name": name, "total_mass": total_mass}
         options |= {"lumping": lumping, "rayleigh": rayleigh, "stiffness": stiffness}
-        return bodies.add_hexes(self.scene, nodes, hexes, contact_surface=contact_surface, **options)
+        return bodies.add_hexes(self.scene, nodes, hexes, contact_surface=contact_surface, thin=thin, **options)

@@ -49,7 +49,7 @@ from softwarp.meshing.tets import (
     tet_volumes,
     weld,
 )
-from softwarp.meshing.tripod_geometry import tripod
+from softwarp.meshing.tripod_geometry import tripod, tripod_bricks
 from softwarp.meshing.trunk_geometry import round_trunk, trunk, trunk_skin
 
 __all__ = [
@@ -118,6 +118,7 @@ __all__ = [
     "tetrahedralize",
     "triangle_areas",
     "tripod",
+    "tripod_bricks",
     "trunk",
     "trunk_skin",
     "union",

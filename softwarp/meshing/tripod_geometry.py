@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.meshing.hexes import HexMesh
 from softwarp.meshing.prisms import cut_prisms, split_quads
 from softwarp.meshing.resolutions import check_name
 from softwarp.meshing.tets import FloatArray, TetMesh, orient
@@ -46,7 +47,8 @@ def tripod(resolution: str = "coarse") -> TetMesh:
     """
     check_name(resolution, DETAILS, "tripod")
     across, along, inwards, layers = DETAILS[resolution]
-    plane, triangles, rank = _plan(across, along, inwards)
+    plane, quads, rank = _plan(across, along, inwards)
+    triangles = split_quads([tuple(quad) for quad in quads], rank)
     heights = np.linspace(-THICKNESS, 0.0, layers + 1)
     nodes = np.concatenate([np.column_stack([plane, np.full(len(plane), z)]) for z in heights])
     pair = np.arange(2 * len(plane))
@@ -54,8 +56,27 @@ def tripod(resolution: str = "coarse") -> TetMesh:
     return TetMesh(nodes, orient(nodes, np.concatenate(tets)), f"tripod {resolution}")
 
 
+def tripod_bricks(resolution: str = "coarse") -> HexMesh:
+    """The star of ``tripod`` in hexahedra between the same nodes.
+
+    Args:
+        resolution: As there.
+
+    Raises:
+        MeshError: If the name is unknown.
+    """
+    check_name(resolution, DETAILS, "tripod")
+    across, along, inwards, layers = DETAILS[resolution]
+    plane, quads, _ = _plan(across, along, inwards)
+    heights = np.linspace(-THICKNESS, 0.0, layers + 1)
+    nodes = np.concatenate([np.column_stack([plane, np.full(len(plane), z)]) for z in heights])
+    pair = np.concatenate([quads, quads + len(plane)], axis=1)
+    hexes = np.concatenate([pair + layer * len(plane) for layer in range(layers)])
+    return HexMesh(nodes, hexes.astype(np.int32), f"tripod {resolution}")
+
+
 def _plan(across: int, along: int, inwards: int) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Points of one layer (point, 2), triangles between them, and a rank that mirror images and legs share."""
+    """Points of one layer (point, 2), cells between them (cell, 4), and a rank that mirror images and legs share."""
     strip = np.concatenate([_sector(across, inwards), _leg(across, along)])  # (row, across + 1, 2)
     rows = len(strip)
     column = np.abs(2 * np.arange(across + 1) - across)
@@ -77,8 +98,7 @@ def _plan(across: int, along: int, inwards: int) -> tuple[FloatArray, NDArray[np
         (number[leg, r, c], number[leg, r, c + 1], number[leg, r + 1, c + 1], number[leg, r + 1, c])
         for leg, r, c in itertools.product(range(LEGS), range(rows - 1), range(across))
     ]
-    order = np.array(ranks)
-    return np.array(points), split_quads(quads, order), order
+    return np.array(points), np.array(quads), np.array(ranks)
 
 
 def _sector(across: int, inwards: int) -> FloatArray:

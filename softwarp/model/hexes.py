@@ -22,6 +22,7 @@ class HexLayout:
     body: IntArray  # (hex,)
     lumped: NDArray[Any]  # (hex, 8) nodal volumes [m^3]
     factor: NDArray[Any]  # (hex,) of the modulus
+    thin: NDArray[np.bool_]  # (hex,) which have the modes of walls
 
 
 @dataclass
@@ -45,9 +46,9 @@ class HexModel:
     shape_gradient: wp.array = shared("shape", unit="1/m", doc="mean gradients of the corners' functions, (shape, 24)")
     shape_mu: wp.array = shared("shape", unit="m", doc="dK/dmu without modes, 36 blocks a >= b, (shape, 324)")
     shape_lam: wp.array = shared("shape", unit="m", doc="dK/dlam likewise, (shape, 324)")
-    mode_mu: wp.array = shared("shape", doc="what nine modes share with corners, per mu, (shape, 216)")
-    mode_lam: wp.array = shared("shape", doc="likewise per lam, (shape, 216)")
-    mode_ratio: wp.array = shared("shape", doc="stiffness of a mode per lam, that per mu being 1, (shape, 9)")
+    mode_mu: wp.array = shared("shape", doc="what modes, 9 or 15, share with corners, per mu, (shape, 24 modes)")
+    mode_lam: wp.array = shared("shape", doc="likewise per lam, (shape, 24 modes)")
+    mode_ratio: wp.array = shared("shape", doc="stiffness of a mode per lam, that per mu being 1, (shape, mode)")
     entry_start: wp.array = shared("block", doc="ranges in entry, (block + 1,)")
     entry: wp.array = shared("entry", doc="64 hex + 8 a + b: its blocks in a block of A")
     hex_block: wp.array = shared("hex", doc="where K_ab, a >= b, goes: 2 block, + 1 transposed, or -1, (hex, 36)")

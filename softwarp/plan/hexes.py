@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,13 @@ from softwarp.scene.parts import Scene
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
 SAME = 1e-11  # of the longest edge: hexahedra that differ by less share a shape
-MODES = 9
+GAUSS = SIGNS / np.sqrt(3.0), np.ones(len(SIGNS))  # points and weights in natural coordinates
+_LINE = [(-np.sqrt(0.6), 5.0 / 9.0), (0.0, 8.0 / 9.0), (np.sqrt(0.6), 5.0 / 9.0)]
+_CUBE = list(itertools.product(_LINE, repeat=3))
+FINE = np.array([[x for x, _ in p] for p in _CUBE]), np.array([np.prod([w for _, w in p]) for p in _CUBE])
+# Displacements of the modes of walls, zeta being across: z (1 - x^2), z (1 - y^2), x - x^3, y - y^3, x (1 - z^2) and
+# y (1 - z^2), and the natural axis along which each one goes
+WALL_MODES = {"bent_x": 0, "bent_y": 1, "lifted_x": 2, "lifted_y": 2, "swollen_x": 2, "swollen_y": 2}
 PAIRS = [(a, b) for a in range(CORNERS) for b in range(a + 1)]
 
 
@@ -25,7 +32,7 @@ def hex_layout(scene: Scene, node_start: IntArray) -> HexLayout:
     """Number the hexahedra body after body."""
     found = [(i, b, b.hexes) for i, b in enumerate(scene.bodies) if b.hexes is not None]
     nodes, lumped = [np.empty((0, CORNERS), dtype=np.int32)], [np.empty((0, CORNERS))]
-    factor = [np.empty(0)]
+    factor, thin = [np.empty(0)], [np.empty(0, dtype=bool)]
     for i, spec, hexes in found:
         nodes.append(hexes + node_start[i])
         volumes = node_volumes(spec.mesh.nodes, hexes)
@@ -34,11 +41,13 @@ def hex_layout(scene: Scene, node_start: IntArray) -> HexLayout:
             volumes = (volumes.sum() / len(spec.mesh.nodes) / counts)[hexes]
         lumped.append(volumes)
         factor.append(np.ones(len(hexes)) if spec.stiffness is None else spec.stiffness)
+        thin.append(np.full(len(hexes), spec.thin))
     return HexLayout(
         nodes=np.concatenate(nodes).astype(np.int32),
         body=np.repeat([i for i, _, _ in found], [len(part) for part in nodes[1:]]).astype(np.int32),
         lumped=np.concatenate(lumped),
         factor=np.concatenate(factor),
+        thin=np.concatenate(thin),
     )
 
 
@@ -66,7 +75,7 @@ def hex_model(layout: HexLayout, nodes: FloatArray, found: Structure) -> HexMode
         shape_body=layout.body[first],
         piece_node=pieces,
         piece_size=tet_volumes(nodes, pieces),
-        **vars(shape_arrays(x[first])),
+        **vars(shape_arrays(x[first], layout.thin[first])),
         **vars(hex_lists(layout, found)),
     )
 
@@ -130,44 +139,83 @@ class ShapeArrays:
     mode_ratio: FloatArray
 
 
-def shape_arrays(x: FloatArray) -> ShapeArrays:
+def shape_arrays(x: FloatArray, thin: NDArray[np.bool_] | None = None) -> ShapeArrays:
     """Stiffness per Lame constant of corners and incompatible modes, for shapes with the corners ``x`` (shape, 8, 3).
 
     With K_uu, K_ui and K_ii linear in mu and lam, modes p that make p' K_ii p = mu + lam s diagonal leave
 
         K = K_uu - sum over modes of (mu a + lam b) (mu a + lam b)' / (mu + lam s).
+
+    Args:
+        x: Corners [m].
+        thin: Which have the modes of walls, (shape,); none by default.
     """
-    count, corners = len(x), CORNERS + 3
-    products = np.zeros((count, corners, corners, 3, 3))  # integrals of grad N_a grad N_b'
-    gradient, volume = np.zeros((count, CORNERS, 3)), np.zeros(count)
-    centre = x.transpose(0, 2, 1) @ shape_gradients(np.zeros(3))
-    for point in SIGNS / np.sqrt(3.0):
+    is_thin = np.zeros(len(x), dtype=bool) if thin is None else thin
+    end, count = 3 * CORNERS, 15 if is_thin.any() else 9
+    rows = {"mode_mu": (count, end), "mode_lam": (count, end), "mode_ratio": (count,)}
+    result = {name: np.zeros((len(x), *shape)) for name, shape in rows.items()}  # modes that a shape has not stay 0
+    result |= {name: np.zeros((len(x), len(PAIRS) * 9)) for name in ("shape_mu", "shape_lam")}
+    for of_walls in np.unique(is_thin):
+        chosen = np.flatnonzero(is_thin == of_walls)
+        mu, lam = _work(x[chosen], bool(of_walls))
+        root = np.linalg.inv(np.linalg.cholesky(mu[:, end:, end:]))
+        ratio, turned = np.linalg.eigh(root @ lam[:, end:, end:] @ root.swapaxes(1, 2))
+        modes, kept = root.swapaxes(1, 2) @ turned, ratio.shape[1]
+        result["shape_mu"][chosen], result["shape_lam"][chosen] = _blocks(mu), _blocks(lam)
+        result["mode_mu"][chosen, :kept] = (mu[:, :end, end:] @ modes).swapaxes(1, 2)
+        result["mode_lam"][chosen, :kept] = (lam[:, :end, end:] @ modes).swapaxes(1, 2)
+        result["mode_ratio"][chosen, :kept] = ratio
+    gradient, volume = np.zeros((len(x), CORNERS, 3)), np.zeros(len(x))
+    for point, share in zip(*GAUSS, strict=True):
         natural = shape_gradients(point)
         jacobian = x.transpose(0, 2, 1) @ natural
-        weight = np.linalg.det(jacobian)
-        g = np.zeros((count, corners, 3))
-        g[:, :CORNERS] = natural @ np.linalg.inv(jacobian)
-        # modes 1 - xi_k^2; their gradients have the mean 0 with the Jacobian of the centre (Taylor et al. 1976)
-        ratio = np.linalg.det(centre) / weight
-        g[:, CORNERS:] = ratio[:, None, None] * (np.diag(-2.0 * point) @ np.linalg.inv(centre))
-        products += weight[:, None, None, None, None] * g[:, :, None, :, None] * g[:, None, :, None, :]
-        gradient += weight[:, None, None] * g[:, :CORNERS]
+        weight = share * np.linalg.det(jacobian)
+        gradient += weight[:, None, None] * (natural @ np.linalg.inv(jacobian))
         volume += weight
-    trace = np.einsum("nabcc->nab", products)
-    per_mu = products.swapaxes(3, 4) + trace[..., None, None] * np.eye(3)
-    mu, lam = (part.swapaxes(2, 3).reshape(count, 3 * corners, 3 * corners) for part in (per_mu, products))
-    end = 3 * CORNERS
-    root = np.linalg.inv(np.linalg.cholesky(mu[:, end:, end:]))
-    ratio, turned = np.linalg.eigh(root @ lam[:, end:, end:] @ root.swapaxes(1, 2))
-    modes = root.swapaxes(1, 2) @ turned
-    return ShapeArrays(
-        shape_x=x.reshape(count, -1),
-        shape_gradient=(gradient / volume[:, None, None]).reshape(count, -1),
-        shape_mu=_blocks(mu),
-        shape_lam=_blocks(lam),
-        mode_mu=(mu[:, :end, end:] @ modes).swapaxes(1, 2).reshape(count, -1),
-        mode_lam=(lam[:, :end, end:] @ modes).swapaxes(1, 2).reshape(count, -1),
-        mode_ratio=ratio,
+    flat = {name: array.reshape(len(x), -1) for name, array in result.items()}
+    mean = (gradient / volume[:, None, None]).reshape(len(x), -1)
+    return ShapeArrays(shape_x=x.reshape(len(x), -1), shape_gradient=mean, **flat)
+
+
+def _work(x: FloatArray, of_walls: bool) -> tuple[FloatArray, FloatArray]:
+    """Integrals of 2 eps_a : eps_b and of tr eps_a tr eps_b over corners and modes, both (shape, 24 + m, 24 + m)."""
+    centre = x.transpose(0, 2, 1) @ shape_gradients(np.zeros(3))
+    along = (centre / np.linalg.norm(centre, axis=1, keepdims=True)).swapaxes(1, 2)  # rows along xi_k
+    count = 3 * CORNERS + 9 + len(WALL_MODES) * of_walls
+    shear, trace = np.zeros((2, len(x), count, count))
+    for point, share in zip(*(FINE if of_walls else GAUSS), strict=True):
+        natural = shape_gradients(point)
+        jacobian = x.transpose(0, 2, 1) @ natural
+        weight = share * np.linalg.det(jacobian)
+        # modes' gradients have the mean 0 with the Jacobian of the centre (Taylor et al. 1976)
+        ratio = (share * np.linalg.det(centre) / weight)[:, None, None]
+        back = ratio * np.linalg.inv(centre)
+        scalars = np.concatenate([natural @ np.linalg.inv(jacobian), np.diag(-2.0 * point) @ back], axis=1)
+        parts = np.einsum("nak,ij->naijk", scalars, np.eye(3)).reshape(len(x), 3 * CORNERS + 9, 3, 3)
+        if of_walls:
+            bent = _wall_gradients(point) @ back
+            extra = np.einsum("nmi,nmk->nmik", along[:, list(WALL_MODES.values())], bent)
+            parts = np.concatenate([parts, extra], axis=1)
+        flat = (parts + parts.swapaxes(2, 3)).reshape(len(x), count, 9)
+        sums = parts.trace(axis1=2, axis2=3)
+        shear += 0.5 * weight[:, None, None] * (flat @ flat.swapaxes(1, 2))
+        trace += weight[:, None, None] * sums[:, :, None] * sums[:, None]
+    return shear, trace
+
+
+def _wall_gradients(point: FloatArray) -> FloatArray:
+    """Natural gradients of the modes of walls, less what would be a mean shear of the thickness, (mode, 3)."""
+    x, y, z = point
+    third = 1.0 / 3.0
+    return np.array(
+        [
+            [-2.0 * x * z, 0.0, 1.0 - x * x],
+            [0.0, -2.0 * y * z, 1.0 - y * y],
+            [1.0 - 3.0 * x * x, 0.0, 0.0],
+            [0.0, 1.0 - 3.0 * y * y, 0.0],
+            [third - z * z, 0.0, -2.0 * x * z],
+            [0.0, third - z * z, -2.0 * y * z],
+        ]
     )
 
 
@@ -178,7 +226,7 @@ def stiffness(arrays: ShapeArrays, mu: float, lam: float) -> FloatArray:
     for (a, b), block in zip(PAIRS, np.moveaxis(blocks.reshape(len(blocks), -1, 3, 3), 1, 0), strict=True):
         result[:, a, :, b] = block
         result[:, b, :, a] = block.swapaxes(1, 2)
-    modes = (mu * arrays.mode_mu + lam * arrays.mode_lam).reshape(len(blocks), MODES, -1)
+    modes = (mu * arrays.mode_mu + lam * arrays.mode_lam).reshape(len(blocks), -1, 3 * CORNERS)
     weighted = modes / (mu + lam * arrays.mode_ratio)[..., None]
     size = 3 * CORNERS
     return np.asarray(result.reshape(-1, size, size) - modes.swapaxes(1, 2) @ weighted)

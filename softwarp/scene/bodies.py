@@ -78,6 +78,7 @@ def add_hexes(
     stiffness: ArrayLike | None = None,
     name: str | None,
     contact_surface: Any = None,
+    thin: bool = False,
 ) -> SoftBody:
     """Add a soft body of hexahedra with incompatible modes."""
     label = scene.new_name(name, f"body{len(scene.bodies)}")
@@ -98,6 +99,7 @@ def add_hexes(
     given: dict[str, Any] = {
         "mesh": nodes.linear(),
         "hexes": nodes.hexes,
+        "thin": bool(thin),
         "material": material,
         "density": value,
         "lumping": lumping,

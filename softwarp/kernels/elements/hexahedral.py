@@ -21,7 +21,6 @@ from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import attachment, corotational, warped
 
 CORNERS = 8
-MODES = 9
 STORED_ROWS = 576  # of a shape: K by rows
 ITERATIONS = warped.ITERATIONS
 SAME = 1.0e-37  # Pa^2, square of a difference between moduli that are equal
@@ -44,9 +43,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     def read_block(stiffness: wp.array2d(dtype=S), w: int, shape: int, m: int, n: int):
         """K_mn of one shape."""
         i = shape * wp.static(STORED_ROWS) + 72 * m + 3 * n
-        return rows(
-            read_vector(stiffness, w, i), read_vector(stiffness, w, i + 24), read_vector(stiffness, w, i + 48)
-        )
+        return rows(read_vector(stiffness, w, i), read_vector(stiffness, w, i + 24), read_vector(stiffness, w, i + 48))
 
     @wp.func
     def turned_block(

@@ -26,7 +26,7 @@ class HexTerm(Term):
     def scale(self, h: float) -> None:
         """Stiffness of every shape, where moduli have changed."""
         s, m, w = self.shard, self.model, self.shard.work
-        inputs = [hexahedral.CORNERS, hexahedral.MODES, m.shape_body, m.shape_mu, m.shape_lam]
+        inputs = [hexahedral.CORNERS, m.mode_ratio.shape[1], m.shape_body, m.shape_mu, m.shape_lam]
         inputs += [m.mode_mu, m.mode_lam, m.mode_ratio, w.body_mu.S, w.body_lam.S]
         s.each(self.k.shape_stiffness, m.shape_body.size, inputs, [w.hex_moduli.S, w.hex_stiffness.S])
 
