@@ -195,7 +195,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 f = add(f, matvec(read_block(stiffness, w, shape, m, n), read_vector(strain, w, 24 * hex + 3 * n)))
             write_vector(force, w, out + 3 * m, f)
 
-    apply_stiffness = wide_hexes.apply_stiffness if wide.is_wide(variant) else apply_each
+    apply_stiffness = apply_each
+    if wide.is_wide(variant):
+        apply_stiffness = wide_hexes.apply_stiffness
+    elif variant.lanes > 1:
+        apply_stiffness = wide_hexes.apply_stiffness_of_lanes
 
     @wp.kernel(module=module, enable_backward=False)
     def hex_force(
@@ -279,6 +283,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 hex_shape,
                 hex_factor,
                 hex_block,
+                body_stiffness_scale_in,
+                shape_stiffness_in,
+                hex_rotation_in,
+                a_out,
+            )
+            return
+        if wp.static(variant.lanes > 1):
+            wide_hexes.add_stiffness_of_lanes(
+                w,
+                hex_body,
+                hex_shape,
+                hex_factor,
+                entry_start,
+                entry,
                 body_stiffness_scale_in,
                 shape_stiffness_in,
                 hex_rotation_in,
