@@ -97,7 +97,8 @@ def _guard_density(model: Model, m: HexModel, x: torch.Tensor, mu: torch.Tensor,
     inner = torch.minimum(depth, guard.clamp(min=0.0))
     square = 0.5 * inner.square() + 0.25 * GUARD_GROWTH * (inner / guard).square() * inner.square()
     square = square + 0.5 * (1.0 + GUARD_GROWTH) * (depth.square() - inner.square())
-    return GUARD * (lam + 2.0 * mu) * square
+    found: torch.Tensor = GUARD * (lam + 2.0 * mu) * square
+    return found
 
 
 def _product(blocks: wp.array, shape: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
