@@ -212,7 +212,12 @@ ROBOTS = {
         lambda options, builder: build_tripod_scene(TripodSceneConfig(**options), builder),
         _tripod,
         TRIPOD_WAYS,
-        {"default": {}, "fine": {"mesh": "fine", **WARPED, "lumping": "volume"}, "p2": SOLID, "accurate": {"fidelity": "accurate"}},
+        {
+            "default": {},
+            "fine": {"mesh": "fine", **WARPED, "lumping": "volume"},
+            "p2": SOLID,
+            "accurate": {"fidelity": "accurate"},
+        },
     ),
     "CatchTheObject": Robot(
         lambda options, builder: build_catch_scene(CatchSceneConfig(**options), builder),
