@@ -51,6 +51,7 @@ class HexModel:
     mode_ratio: wp.array = shared("shape", doc="stiffness of a mode per lam, that per mu being 1, (shape, mode)")
     entry_start: wp.array = shared("block", doc="ranges in entry, (block + 1,)")
     entry: wp.array = shared("entry", doc="64 hex + 8 a + b: its blocks in a block of A")
+    hex_block: wp.array = shared("hex", doc="where K_ab, a >= b, goes: 2 block, + 1 transposed, or -1, (hex, 36)")
     carried_block: wp.array = shared("carried", doc="blocks of A with hexahedra of which frames carry corners")
     carried_start: wp.array = shared("carried", doc="ranges in carried_entry")
     carried_entry: wp.array = shared("entry", doc="such a code and the carried items on its sides, or -1, (entry, 3)")

@@ -245,7 +245,7 @@ def coupled(model: Model) -> Model:
         inertia = inertia_lists(quadratic.layout, found, model.node_count)
         quadratic = replace(quadratic, **vars(entry_lists(found)), **vars(inertia))
     if hexes is not None:
-        hexes = replace(hexes, **vars(hex_lists(found)))
+        hexes = replace(hexes, **vars(hex_lists(hexes.layout, found)))
     parts: dict[str, Any] = {"quadratic": quadratic, "hexes": hexes, "cavities": chambers}
     other = replace(model, symbolic=found.symbolic, **parts, **found.model_arrays())
     return upload(other, model.device, real_of(model.precision))

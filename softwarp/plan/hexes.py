@@ -76,7 +76,7 @@ def hex_model(layout: HexLayout, nodes: FloatArray, found: Structure) -> HexMode
         piece_node=pieces,
         piece_size=tet_volumes(nodes, pieces),
         **vars(shape_arrays(x[first], layout.thin[first])),
-        **vars(hex_lists(found)),
+        **vars(hex_lists(layout, found)),
     )
 
 
@@ -86,6 +86,7 @@ class HexLists:
 
     entry_start: IntArray
     entry: IntArray
+    hex_block: IntArray
     carried_block: IntArray
     carried_start: IntArray
     carried_entry: IntArray
@@ -94,12 +95,18 @@ class HexLists:
     held_entry: IntArray
 
 
-def hex_lists(found: Structure) -> HexLists:
+def hex_lists(layout: HexLayout, found: Structure) -> HexLists:
     """Lists of the structure of A."""
     kept = found.lists["hex"]
+    block = np.repeat(np.arange(len(kept.start) - 1), np.diff(kept.start))
+    element, a, b = kept.entry >> 6, (kept.entry >> 3) & 7, kept.entry & 7
+    high, low = np.maximum(a, b), np.minimum(a, b)
+    places = np.full((len(layout.nodes), len(PAIRS)), -1, dtype=np.int32)
+    places[element, high * (high + 1) // 2 + low] = 2 * block + (a < b)
     return HexLists(
         entry_start=kept.start,
         entry=kept.entry,
+        hex_block=places,
         carried_block=kept.carried.target,
         carried_start=kept.carried.start,
         carried_entry=kept.carried.entry,

@@ -324,3 +324,38 @@ def test_hexes_say_what_they_do_not_know() -> None:
         sw.gradients.Rollout(sim)
     with pytest.raises(ValueError, match="mesh hexahedra with add_tets"):
         sim.modes(1)
+
+
+def test_a_chamber_blows_a_hollow_brick_up() -> None:
+    """Clapeyron: half of pressure times the change of volume is stored, where 26 bricks enclose air."""
+    mesh = meshing.brick((0.03, 0.03, 0.03), (3, 3, 3))
+    hollow = meshing.HexMesh(*meshing.compact(mesh.nodes, np.delete(mesh.hexes, 13, axis=0)))
+    faces = hollow.linear().surface()
+    wall = faces[((hollow.nodes[faces] > 1e-9) & (hollow.nodes[faces] < 0.03 - 1e-9)).all(axis=(1, 2))]
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = builder.add_hexes(hollow, material=sw.Corotational(YOUNGS, 0.45), density=1000.0, rayleigh=(50.0, 0.01))
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-9)))
+    used, corner = np.unique(wall, return_inverse=True)
+    builder.add_cavity(body, hollow.nodes[used], corner.reshape(-1, 3)[:, ::-1])
+    sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.01)
+    rest = float(sim.cavity_volume[0, 0])
+    sim.control.cavity_pressure[:] = 10.0
+    assert sim.solve_static(1e-10).reason[0].is_equilibrium
+    grown = float(sim.cavity_volume[0, 0]) - rest
+    assert rest == pytest.approx(1e-6)
+    assert grown > 0.0
+    assert float(sim.elastic_energy()[0]) == pytest.approx(0.5 * 10.0 * grown, rel=2e-3)
+
+
+def test_a_brick_rests_on_the_floor() -> None:
+    """Contact through the triangles of the boundary carries the weight."""
+    mesh = meshing.brick((0.04, 0.04, 0.02), (2, 2, 1))
+    builder = sw.ModelBuilder()
+    body = builder.add_hexes(mesh, material=sw.Corotational(YOUNGS, 0.45), density=1000.0, rayleigh=(20.0, 0.01))
+    floor = builder.add_rigid(sw.Plane(), kinematic=True, pose=(0.0, 0.0, -0.001))
+    builder.add_contact(body, floor, mu=0.5)
+    sim = sw.Simulation(builder.finalize(), dt=0.01)
+    for _ in range(100):
+        sim.step()
+    assert int(sim.status[0]) == 0
+    assert float(sim.contact_force(body, floor)[0, 2]) == pytest.approx(1000.0 * 3.2e-5 * 9.81, rel=1e-3)

@@ -15,12 +15,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import wide, wide_hexes
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.algebra.vectors import algebra
 from softwarp.kernels.elements import attachment, corotational, warped
 
 CORNERS = 8
-STORED_ROWS = 324  # of a shape: 36 blocks K_ab, a >= b
+STORED_ROWS = 576  # of a shape: K by rows
 ITERATIONS = warped.ITERATIONS
 SAME = 1.0e-37  # Pa^2, square of a difference between moduli that are equal
 
@@ -30,7 +31,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     """How blocks are read and turned."""
     S = variant.S
     a = algebra(variant)
-    vector, rows, read_vector = a.vector, a.rows, a.read_vector
+    rows, read_vector = a.rows, a.read_vector
     matmul, transposed = a.matmul, a.transposed
 
     @wp.func
@@ -41,19 +42,9 @@ def functions(variant: Variant) -> SimpleNamespace:
     @wp.func
     def read_block(stiffness: wp.array2d(dtype=S), w: int, shape: int, m: int, n: int):
         """K_mn of one shape."""
-        i = shape * wp.static(STORED_ROWS) + ((m * (m + 1)) // 2 + n) * 9
-        across = 1
-        down = 3
-        if m < n:  # the transpose is stored
-            i = shape * wp.static(STORED_ROWS) + ((n * (n + 1)) // 2 + m) * 9
-            across = 3
-            down = 1
-        j = i + down
-        k = j + down
+        i = shape * wp.static(STORED_ROWS) + 72 * m + 3 * n
         return rows(
-            vector(stiffness[w, i], stiffness[w, i + across], stiffness[w, i + 2 * across]),
-            vector(stiffness[w, j], stiffness[w, j + across], stiffness[w, j + 2 * across]),
-            vector(stiffness[w, k], stiffness[w, k + across], stiffness[w, k + 2 * across]),
+            read_vector(stiffness, w, i), read_vector(stiffness, w, i + 24), read_vector(stiffness, w, i + 48)
         )
 
     @wp.func
@@ -133,7 +124,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             left = mul(mu, S(mode_mu[shape, i])) + mul(lam, S(mode_lam[shape, i]))
                             right = mul(mu, S(mode_mu[shape, j])) + mul(lam, S(mode_lam[shape, j]))
                             value -= div(mul(left, right), mu + mul(lam, S(mode_ratio[shape, mode])))
-                        shape_stiffness_out[w, wp.static(STORED_ROWS) * shape + place] = value
+                        row = 3 * m + entry // 3
+                        column = 3 * n + entry % 3
+                        shape_stiffness_out[w, wp.static(STORED_ROWS) * shape + 24 * row + column] = value
+                        shape_stiffness_out[w, wp.static(STORED_ROWS) * shape + 24 * column + row] = value
                         place += 1
 
     @wp.func
@@ -185,6 +179,26 @@ def kernels(variant: Variant) -> SimpleNamespace:
         det = mul(gx, c.xx) - mul(sxy, c.xy) - mul(sxz, c.xz)
         return apply(c, scaled(t, div(S(real(1.0)), wp.max(det, S(real(wp.static(warped.LEAST)))))))
 
+    @wp.func
+    def apply_each(
+        stiffness: wp.array2d(dtype=S),
+        strain: wp.array2d(dtype=S),
+        w: int,
+        shape: int,
+        hex: int,
+        out: int,
+        force: wp.array2d(dtype=S),
+    ):
+        """K u of one hexahedron, whose first corner has u = 0, to rows ``out`` onwards."""
+        corners = int(wp.static(CORNERS))
+        for m in range(1, corners):
+            f = Vector()
+            for n in range(1, corners):
+                f = add(f, matvec(read_block(stiffness, w, shape, m, n), read_vector(strain, w, 24 * hex + 3 * n)))
+            write_vector(force, w, out + 3 * m, f)
+
+    apply_stiffness = wide_hexes.apply_stiffness if wide.is_wide(variant) else apply_each
+
     @wp.kernel(module=module, enable_backward=False)
     def hex_force(
         first: int,
@@ -220,13 +234,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             u = subtract(combination(d, Q), constant(shape_x, shape, 3 * m))
             write_vector(hex_strain_out, w, strain + 3 * m, u)
         out = first + 24 * hex
+        apply_stiffness(shape_stiffness_in, hex_strain_out, w, shape, hex, out, element_force_out)
         torque = Vector()
         for m in range(1, corners):
-            force = Vector()
-            for n in range(1, corners):
-                K = read_block(shape_stiffness_in, w, shape, m, n)
-                force = add(force, matvec(K, read_vector(hex_strain_out, w, strain + 3 * n)))
-            write_vector(element_force_out, w, out + 3 * m, force)
+            force = read_vector(element_force_out, w, out + 3 * m)
             y = add(read_vector(hex_strain_out, w, strain + 3 * m), constant(shape_x, shape, 3 * m))
             torque = add(torque, cross(y, force))
         h = balance(M, torque)
@@ -245,6 +256,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         hex_body: wp.array(dtype=wp.int32),
         hex_shape: wp.array(dtype=wp.int32),
         hex_factor: wp.array(dtype=real),
+        hex_block: wp.array2d(dtype=wp.int32),
         entry_start: wp.array(dtype=wp.int32),
         entry: wp.array(dtype=wp.int32),
         # Workspace in
@@ -262,6 +274,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
             part, w = wp.tid()
             begin_block = part
             end_block = part + 1
+        if wp.static(wide.is_wide(variant)):
+            wide_hexes.add_stiffness(
+                w,
+                hex_body,
+                hex_shape,
+                hex_factor,
+                hex_block,
+                body_stiffness_scale_in,
+                shape_stiffness_in,
+                hex_rotation_in,
+                a_out,
+            )
+            return
         for block in range(begin_block, end_block):
             for p in range(entry_start[block], entry_start[block + 1]):
                 code = entry[p]

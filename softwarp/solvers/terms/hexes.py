@@ -40,7 +40,7 @@ class HexTerm(Term):
     def tangent(self, h: float) -> None:
         """Stiffness of all hexahedra."""
         s, m, w = self.shard, self.model, self.shard.work
-        inputs = [*self.elements, m.entry_start, m.entry]
+        inputs = [*self.elements, m.hex_block, m.entry_start, m.entry]
         inputs += [w.body_stiffness.S, w.hex_stiffness.S, w.hex_rotation.S]
         s.each(self.k.block_stiffness, s.variant.parts(s.blocks), inputs, [w.a.S])
         inputs = [*self.elements, m.carried_block, m.carried_start, m.carried_entry]

@@ -96,7 +96,7 @@ class Workspace:
     grip: Rows = scratch("grip", grip.ROWS, doc="sums of these and of their moments over nodes that a frame carries")
     gauss_stiffness: Rows = scratch("stored Gauss point", 90, unit="N/m", doc="ten blocks of its linear tet")
     hex_moduli: Rows = scratch("hex shape", 2, unit="Pa", doc="Lame constants of hex_stiffness")
-    hex_stiffness: Rows = scratch("hex shape", hexahedral.STORED_ROWS, unit="N/m", doc="36 blocks K_ab, a >= b")
+    hex_stiffness: Rows = scratch("hex shape", hexahedral.STORED_ROWS, unit="N/m", doc="K of a shape by rows")
     hex_rotation: Rows = scratch("hex", 9, doc="rotation Q from the axes of the shape")
     hex_strain: Rows = scratch("hex", 24, unit="m", doc="displacements of corners in these axes, from the first")
     segment_force: Rows = scratch("segment", 12, unit="N", doc="force and moment [N m] of a rod segment on its ends")
