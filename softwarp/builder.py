@@ -315,7 +315,7 @@ class ModelBuilder(Bricks, Tendons, Telescopes):
         """Pull at boundary faces of a soft body with a dead load per area.
 
         The load keeps its direction in the world and counts the faces' area at rest. Nodes receive it consistently:
-        those of linear faces a third each, those of quadratic ones by their shape functions. A pressure that turns
+        those of linear faces a third each, others by their shape functions. A pressure that turns
         with a surface is that of an air chamber.
 
         Args:

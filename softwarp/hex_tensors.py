@@ -77,7 +77,7 @@ def energy(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
     mu, lam = (value.double() for value in moduli(m, model, parameters))
     u = u.double()
     total = mu * _product(m.shape_mu, shape, u) + lam * _product(m.shape_lam, shape, u)
-    kept = [wp.to_torch(values).unflatten(1, (9, 24)).double()[shape] for values in (m.mode_mu, m.mode_lam)]
+    kept = [wp.to_torch(values).unflatten(1, (-1, 24)).double()[shape] for values in (m.mode_mu, m.mode_lam)]
     a, b = (torch.einsum("hmk,whk->whm", values, u) for values in kept)
     ratio = wp.to_torch(m.mode_ratio).double()[shape]
     mu, lam = mu[..., None], lam[..., None]

@@ -9,7 +9,7 @@ from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.finger_geometry import FingerMesh, finger
-from softwarp.meshing.hexes import HexMesh, brick, check_hexes
+from softwarp.meshing.hexes import HexMesh, brick, check_hexes, quad_shares
 from softwarp.meshing.lumen import Lumen
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.nasal_geometry import nasal_passage
@@ -99,6 +99,7 @@ __all__ = [
     "orient",
     "orient_surface",
     "pad",
+    "quad_shares",
     "quadruped",
     "quadruped_skin",
     "radius_ratio",

@@ -147,3 +147,28 @@ def split(hexes: IntArray) -> IntArray:
                 a, b, c = turned[:, 0], turned[:, 1 + half], turned[:, 2 + half]
                 found[chosen, 2 * number + half] = np.stack([a, c, b, hexes[chosen, corner]], axis=1)
     return found.reshape(-1, 4)
+
+
+def quad_shares(nodes: FloatArray, hexes: IntArray, triangles: IntArray) -> tuple[IntArray, FloatArray]:
+    """Integrals of shape functions over halves of faces, as ``split`` cuts them, taken for halves of parallelograms.
+
+    Args:
+        nodes: Positions [m], (node, 3).
+        hexes: Corners, (hex, 8).
+        triangles: Halves of faces by their corners, (tri, 3).
+
+    Returns:
+        Nodes in ascending order, (n,), and their integrals [m^2], (n,): of a half the corner across the cut gets 5/12
+        of its area, those on the cut a quarter each and the fourth corner of the face the rest.
+    """
+    quads = np.asarray(hexes)[:, FACES].reshape(-1, 4)
+    first = quads.argmin(axis=1)[:, None]
+    turned = quads[np.arange(len(quads))[:, None], (first + np.arange(4)) % 4]  # the cut joins numbers 0 and 2
+    halves = np.concatenate([turned, turned[:, [2, 3, 0, 1]]])  # numbers 0, 1, 2 are a half's, and 3 is the fourth
+    number = {tuple(half): place for place, half in enumerate(np.sort(halves[:, :3], axis=1).tolist())}
+    held = halves[[number[tuple(half)] for half in np.sort(triangles, axis=1).tolist()]]
+    a, b, c = (nodes[held[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    node, place = np.unique(held, return_inverse=True)
+    value = area[:, None] * (np.array([3.0, 5.0, 3.0, 1.0]) / 12.0)
+    return node.astype(np.int32), np.bincount(place.ravel(), value.ravel()).astype(np.float64)

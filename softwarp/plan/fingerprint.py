@@ -112,6 +112,7 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
     if model.hexes is not None:
         digest.update(b"hexes")
         add(model.hexes, {"nodes": INT})
+        add(model.hexes.layout, {"thin": BOOL})
     for body in scene.bodies:
         if body.stiffness is not None:
             digest.update(body.stiffness.tobytes())

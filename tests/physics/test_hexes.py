@@ -234,7 +234,7 @@ def test_momentum_is_kept(rng: np.random.Generator) -> None:
     assert float(angular.norm()) == pytest.approx(float(before[1].norm()), rel=0.05)
 
 
-def moving(num_worlds: int, path: str, precision: str = "float32") -> sw.Simulation:
+def moving(num_worlds: int, path: str, precision: str = "float32", device: str = "cpu") -> sw.Simulation:
     """A beam with a cable and a rigid body on its end, whose worlds differ in moduli."""
     mesh = meshing.brick((0.12, 0.02, 0.02), (6, 2, 1))
     builder = sw.ModelBuilder()
@@ -244,7 +244,8 @@ def moving(num_worlds: int, path: str, precision: str = "float32") -> sw.Simulat
     builder.attach(body, np.flatnonzero(mesh.nodes[:, 0] > 0.12 - 1e-9), to=tool)
     builder.add_cable(body, [(x, 0.01, 0.018) for x in np.linspace(0.01, 0.1, 6)], (-0.01, 0.01, 0.018))
     builder.add_marker(body, (0.1, 0.01, 0.02))
-    return sw.Simulation(builder.finalize(num_worlds, precision=precision), dt=0.01, solver_path=path)
+    model = builder.finalize(num_worlds, device, precision)
+    return sw.Simulation(model, dt=0.01, **({"solver_path": path} if device == "cpu" else {}))
 
 
 def play(sim: sw.Simulation, worlds: list[int], steps: int = 20) -> dict[str, torch.Tensor]:
@@ -280,6 +281,16 @@ def test_lanes_and_precisions_agree() -> None:
     for path in ("scalar", "lanes"):
         found = play(moving(1, path), [3])["node_x"]
         assert float((found - exact).abs().max()) < 2e-6
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 5e-6), ("float64", 1e-12)])
+def test_a_gpu_agrees(precision: str, tolerance: float) -> None:
+    """With a CPU to rounding, and worlds with themselves alone to the bit."""
+    whole = play(moving(9, "", precision, "cuda:0"), list(range(9)))
+    exact = play(moving(9, "scalar", precision), list(range(9)))["node_x"]
+    assert float((whole["node_x"].cpu() - exact).abs().max()) < tolerance
+    assert_same(play(moving(4, "", precision, "cuda:0"), [7, 1, 2, 3]), whole, [0], [7])
 
 
 def test_a_carried_end_moves_as_a_light_one(rng: np.random.Generator) -> None:
@@ -359,3 +370,26 @@ def test_a_brick_rests_on_the_floor() -> None:
         sim.step()
     assert int(sim.status[0]) == 0
     assert float(sim.contact_force(body, floor)[0, 2]) == pytest.approx(1000.0 * 3.2e-5 * 9.81, rel=1e-3)
+
+
+def test_tractions_and_membranes_go_with_hexahedra() -> None:
+    """A pulled bar is longer by the load per modulus; glued skins on both sides bear their share of it."""
+    size, skin = (0.1, 0.02, 0.01), 1e-4
+    mesh = meshing.brick(size, (10, 2, 1))
+    stretch = []
+    for youngs in (0.0, 2e6):
+        builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        body = builder.add_hexes(mesh, material=sw.Corotational(YOUNGS, 0.0), density=1000.0, rayleigh=(5.0, 0.01))
+        builder.fix(body, box=((-1.0, -1.0, -1.0), (1e-9, 1.0, 1.0)))
+        builder.add_traction(body, (100.0, 0.0, 0.0), box=((0.1 - 1e-9, -1.0, -1.0), (1.0, 1.0, 1.0)))
+        if youngs:
+            faces = mesh.linear().surface()
+            for height in (0.0, size[2]):
+                side = faces[np.abs(mesh.nodes[faces, 2] - height).max(axis=1) < 1e-9]
+                builder.add_membrane(body, side, thickness=skin, youngs=youngs, nu=0.0)
+        sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.01)
+        assert sim.solve_static().reason[0].is_equilibrium
+        stretch.append(float(sim.node_x[0, :, 0].max()) / size[0] - 1.0)
+    alone = 100.0 / YOUNGS
+    assert stretch[0] == pytest.approx(alone, rel=2e-3)
+    assert stretch[1] == pytest.approx(alone / (1.0 + 2.0 * skin * 2e6 / (YOUNGS * size[2])), rel=0.02)

@@ -43,9 +43,7 @@ def functions(variant: Variant) -> SimpleNamespace:
     def read_block(stiffness: wp.array2d(dtype=S), w: int, shape: int, m: int, n: int):
         """K_mn of one shape."""
         i = shape * wp.static(STORED_ROWS) + 72 * m + 3 * n
-        return rows(
-            read_vector(stiffness, w, i), read_vector(stiffness, w, i + 24), read_vector(stiffness, w, i + 48)
-        )
+        return rows(read_vector(stiffness, w, i), read_vector(stiffness, w, i + 24), read_vector(stiffness, w, i + 48))
 
     @wp.func
     def turned_block(
@@ -197,7 +195,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 f = add(f, matvec(read_block(stiffness, w, shape, m, n), read_vector(strain, w, 24 * hex + 3 * n)))
             write_vector(force, w, out + 3 * m, f)
 
-    apply_stiffness = wide_hexes.apply_stiffness if wide.is_wide(variant) else apply_each
+    apply_stiffness = apply_each
+    if wide.is_wide(variant):
+        apply_stiffness = wide_hexes.apply_stiffness
+    elif variant.lanes > 1:
+        apply_stiffness = wide_hexes.apply_stiffness_of_lanes
 
     @wp.kernel(module=module, enable_backward=False)
     def hex_force(
@@ -281,6 +283,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 hex_shape,
                 hex_factor,
                 hex_block,
+                body_stiffness_scale_in,
+                shape_stiffness_in,
+                hex_rotation_in,
+                a_out,
+            )
+            return
+        if wp.static(variant.lanes > 1):
+            wide_hexes.add_stiffness_of_lanes(
+                w,
+                hex_body,
+                hex_shape,
+                hex_factor,
+                entry_start,
+                entry,
                 body_stiffness_scale_in,
                 shape_stiffness_in,
                 hex_rotation_in,
