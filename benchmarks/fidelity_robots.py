@@ -29,7 +29,7 @@ from softwarp.envs.scenes.tripod import HEIGHT, SERVOS, build_tripod_scene, trip
 from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
 from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.finger_geometry import FLANGE
-from softwarp.meshing.tripod_geometry import HOLE_RADIUS, REACH, SIDE
+from softwarp.meshing.tripod_geometry import HELD, HOLE_RADIUS
 from softwarp.meshing.trunk_geometry import LENGTH
 
 from . import trunk
@@ -44,7 +44,6 @@ DIAMOND_WAYS = 1e-3 * np.array([[0.0, 0.0, -32.51], [0.0, 0.0, 27.70], [32.21, 0
 TRIPOD_LOADS = ((0.0, 0.0, -20.0), (0.0, 0.0, 20.0), (20.0, 0.0, -20.0))  # m/s^2
 # m, of the hole's rim under these: limits that ``fidelity_tripod`` finds
 TRIPOD_WAYS = 1e-3 * np.array([[0.0, -0.13, -4.86], [0.0, 0.25, 4.82], [0.26, -0.13, -4.86]])
-TRIPOD_HELD = SIDE + (REACH - SIDE) * 5.0 / 6.0  # m, from the axis: the line from which arms hold the coarse mesh
 
 
 @dataclass(frozen=True)
@@ -131,14 +130,14 @@ def hang_tripod(mesh: Any, config: TripodSceneConfig, loads: Sequence[Sequence[f
 
     def held(x: Floats) -> NDArray[np.bool_]:
         along = [(x @ turn(servo))[:, 1] for servo in range(SERVOS)]
-        return np.asarray(np.max(along, axis=0) > TRIPOD_HELD - 1.0e-6)
+        return np.asarray(np.max(along, axis=0) > HELD - 1.0e-6)
 
     return weighed(mesh, config, config.total_mass, held, (0.0, HOLE_RADIUS, HEIGHT), loads)
 
 
 def _tripod(options: Options) -> tuple[Floats, Floats]:
     config = TripodSceneConfig(**options)
-    mesh = tripod_walls(config) if config.element == "walls" else tripod_mesh(config)
+    mesh = tripod_walls() if config.element == "walls" else tripod_mesh(config)
     return hang_tripod(mesh, config, TRIPOD_LOADS)
 
 

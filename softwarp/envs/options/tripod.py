@@ -64,7 +64,7 @@ class TripodSceneConfig(FidelityConfig):
         check_choice(self, "element", ELEMENTS)
         if self.element == "walls" and (self.mesh != "coarse" or self.rotation != "warped"):
             raise ValueError(
-                f"{type(self).__name__}: element='walls' needs mesh='coarse', one layer of hexahedra, and "
+                f"{type(self).__name__}: element='walls' has a mesh of its own (leave mesh 'coarse') and needs "
                 f"rotation='warped', got {self.mesh!r} and {self.rotation!r}; fidelity='accurate' chooses all three"
             )
         check_choice(self, "rotation", ROTATIONS)

@@ -85,7 +85,7 @@ def add_star(config: TripodSceneConfig, builder: ModelBuilder) -> SoftBody:
     given: dict[str, Any] = {"material": law, "total_mass": config.total_mass, "rayleigh": config.rayleigh}
     given["name"] = "tripod"
     if config.element == "walls":
-        return builder.add_hexes(tripod_walls(config), thin=True, **given)
+        return builder.add_hexes(tripod_walls(), thin=True, **given)
     element = cast('Literal["p1", "p2"]', config.element)
     lumping = cast('Literal["volume", "uniform"]', config.lumping if element == "p1" else "volume")
     return builder.add_tets(tripod_mesh(config), element=element, lumping=lumping, **given)
@@ -129,9 +129,9 @@ def tripod_mesh(config: TripodSceneConfig) -> meshing.TetMesh:
     return meshing.TetMesh(np.stack([x, -y, HEIGHT - z], axis=1), mesh.tets, name=Path(config.mesh).name)
 
 
-def tripod_walls(config: TripodSceneConfig) -> meshing.HexMesh:
-    """The generated hexahedra of a resolution, in their place."""
-    made = meshing.tripod_bricks(config.mesh)
+def tripod_walls() -> meshing.HexMesh:
+    """The generated hexahedra in their place."""
+    made = meshing.tripod_bricks()
     return meshing.HexMesh(made.nodes + np.array([0.0, 0.0, HEIGHT]), made.hexes, made.name)
 
 
