@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,11 +25,11 @@ from softwarp.envs.options.trunk import TrunkSceneConfig
 from softwarp.envs.scenes.catch_the_object import add_pad, build_catch_scene
 from softwarp.envs.scenes.diamond import EFFECTOR, build_diamond_scene, diamond_mesh
 from softwarp.envs.scenes.gripper import build_gripper_scene
-from softwarp.envs.scenes.tripod import HEIGHT, SERVOS, build_tripod_scene, tripod_mesh, turn
+from softwarp.envs.scenes.tripod import HEIGHT, SERVOS, build_tripod_scene, tripod_mesh, tripod_walls, turn
 from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
 from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.finger_geometry import FLANGE
-from softwarp.meshing.tripod_geometry import HOLE_RADIUS, REACH, SIDE
+from softwarp.meshing.tripod_geometry import HELD, HOLE_RADIUS
 from softwarp.meshing.trunk_geometry import LENGTH
 
 from . import trunk
@@ -44,7 +44,6 @@ DIAMOND_WAYS = 1e-3 * np.array([[0.0, 0.0, -32.51], [0.0, 0.0, 27.70], [32.21, 0
 TRIPOD_LOADS = ((0.0, 0.0, -20.0), (0.0, 0.0, 20.0), (20.0, 0.0, -20.0))  # m/s^2
 # m, of the hole's rim under these: limits that ``fidelity_tripod`` finds
 TRIPOD_WAYS = 1e-3 * np.array([[0.0, -0.13, -4.86], [0.0, 0.25, 4.82], [0.26, -0.13, -4.86]])
-TRIPOD_HELD = SIDE + (REACH - SIDE) * 5.0 / 6.0  # m, from the axis: the line from which arms hold the coarse mesh
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def weighed(
     """Where a point of a solid rests under gravity [m/s^2], in float64, (case, 3), and where it is without.
 
     Args:
-        mesh: Nodes and linear elements.
+        mesh: Nodes and linear elements, or hexahedra of walls.
         config: Has ``youngs``, ``nu``, ``rotation`` and ``element``, perhaps ``lumping``.
         mass: Of the solid [kg].
         held: Which of places (node, 3) are held.
@@ -90,14 +89,13 @@ def weighed(
         stiffness: Factors of the modulus.
     """
     builder = softwarp.ModelBuilder()
-    body = builder.add_tets(
-        mesh,
-        material=softwarp.Corotational(config.youngs, config.nu, method=config.rotation),
-        element=config.element,
-        total_mass=mass,
-        lumping=cast("Any", getattr(config, "lumping", "volume") if config.element == "p1" else "volume"),
-        stiffness=stiffness,
-    )
+    law = softwarp.Corotational(config.youngs, config.nu, method=config.rotation)
+    given: dict[str, Any] = {"material": law, "total_mass": mass, "stiffness": stiffness}
+    if isinstance(mesh, meshing.HexMesh):
+        body = builder.add_hexes(mesh, thin=True, **given)
+    else:
+        lumping = getattr(config, "lumping", "volume") if config.element == "p1" else "volume"
+        body = builder.add_tets(mesh, element=config.element, lumping=lumping, **given)
     builder.fix(body, nodes=np.flatnonzero(held(builder.bodies[body].mesh.nodes)))
     builder.add_marker(body, tuple(point), tolerance=0.006)
     sim = softwarp.Simulation(builder.finalize(len(gravity), "cpu", "float64"))
@@ -132,14 +130,15 @@ def hang_tripod(mesh: Any, config: TripodSceneConfig, loads: Sequence[Sequence[f
 
     def held(x: Floats) -> NDArray[np.bool_]:
         along = [(x @ turn(servo))[:, 1] for servo in range(SERVOS)]
-        return np.asarray(np.max(along, axis=0) > TRIPOD_HELD - 1.0e-6)
+        return np.asarray(np.max(along, axis=0) > HELD - 1.0e-6)
 
     return weighed(mesh, config, config.total_mass, held, (0.0, HOLE_RADIUS, HEIGHT), loads)
 
 
 def _tripod(options: Options) -> tuple[Floats, Floats]:
     config = TripodSceneConfig(**options)
-    return hang_tripod(tripod_mesh(config), config, TRIPOD_LOADS)
+    mesh = tripod_walls() if config.element == "walls" else tripod_mesh(config)
+    return hang_tripod(mesh, config, TRIPOD_LOADS)
 
 
 def _finger(options: Options) -> tuple[Floats, Floats]:
@@ -212,7 +211,12 @@ ROBOTS = {
         lambda options, builder: build_tripod_scene(TripodSceneConfig(**options), builder),
         _tripod,
         TRIPOD_WAYS,
-        {"default": {}, "fine": {"mesh": "fine", **WARPED, "lumping": "volume"}, "p2": SOLID},
+        {
+            "default": {},
+            "fine": {"mesh": "fine", **WARPED, "lumping": "volume"},
+            "p2": SOLID,
+            "accurate": {"fidelity": "accurate"},
+        },
     ),
     "CatchTheObject": Robot(
         lambda options, builder: build_catch_scene(CatchSceneConfig(**options), builder),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softwarp import interop, meshing
+from softwarp.bricks import Bricks
 from softwarp.model.handles import Cavity, ContactPair, Handle, Joint, RigidBody, Rod, SoftBody
 from softwarp.model.model import Model
 from softwarp.plan.compile import plan
@@ -28,7 +29,7 @@ from softwarp.tendons import Tendons
 Precision = Literal["float32", "float64"]
 
 
-class ModelBuilder(Tendons, Telescopes):
+class ModelBuilder(Bricks, Tendons, Telescopes):
     """Collects bodies, rods, supports, cables, markers, loads and contacts of a scene. SI units.
 
     Args:
@@ -314,7 +315,7 @@ class ModelBuilder(Tendons, Telescopes):
         """Pull at boundary faces of a soft body with a dead load per area.
 
         The load keeps its direction in the world and counts the faces' area at rest. Nodes receive it consistently:
-        those of linear faces a third each, those of quadratic ones by their shape functions. A pressure that turns
+        those of linear faces a third each, others by their shape functions. A pressure that turns
         with a surface is that of an air chamber.
 
         Args:

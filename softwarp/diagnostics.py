@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from softwarp import checks, interop
+from softwarp import checks, hex_tensors, interop
 from softwarp.kernels.algebra.lanes import Variant, variant
 from softwarp.kernels.elements import energy, quadratic, rod
 from softwarp.model.codes import TURNED
@@ -81,10 +81,12 @@ def _of_laws(
 
 @alone
 def elastic_energy(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
-    """Elastic energy of tets, rods and membranes [J], shape (world,)."""
+    """Elastic energy of tets, hexahedra, rods and membranes [J], shape (world,)."""
     of_tets, _ = _per_tet(model, state, parameters)
     of_points, _ = _per_point(model, state, parameters)
     total: torch.Tensor = of_tets.sum(dim=1) + of_points.sum(dim=1)
+    if model.hexes is not None:
+        total = total + hex_tensors.energy(model, state, parameters).sum(dim=1)
     return total + segment_energy(model, state, parameters).sum(dim=1) + _membrane_energy(model, state, parameters)
 
 
@@ -261,7 +263,7 @@ def _spin_momentum(model: Model, state: State, parameters: Parameters) -> torch.
 
 @alone
 def node_stress(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
-    """Von Mises stress [Pa] averaged to nodes with the volumes of tets, or of Gauss points, shape (world, node).
+    """Von Mises stress [Pa] averaged to nodes with the volumes of elements, or of Gauss points, shape (world, node).
 
     A Gauss point of a quadratic tet counts for the corner that it is near and for the nodes of that corner's edges.
     """
@@ -275,10 +277,14 @@ def node_stress(model: Model, state: State, parameters: Parameters) -> torch.Ten
     if q is not None:
         near = q.nodes[:, AROUND_CORNERS].reshape(-1, 4)
         parts.append((near, q.point_volume, _per_point(model, state, parameters)[1]))
+    if m.hexes is not None:
+        cauchy, _ = hex_tensors.stress_and_strain(m, state, parameters)
+        deviator = cauchy - torch.einsum("...cc,ij->...ij", cauchy, torch.eye(3).to(cauchy) / 3.0)
+        parts.append((m.hexes.nodes, m.hexes.hex_volume, (1.5 * deviator.square().sum(dim=(-2, -1))).sqrt()))
     for node, size, value in parts:
         corners = torch.as_tensor(node.astype(np.int64), device=stress.device)
         volume = wp.to_torch(size).to(stress.dtype)
-        for corner in range(4):
+        for corner in range(node.shape[1]):
             weight.index_add_(0, corners[:, corner], volume)
             total.index_add_(1, corners[:, corner], value * volume)
     average: torch.Tensor = total / weight
@@ -327,7 +333,7 @@ def internal_force(systems: Sequence[System]) -> torch.Tensor:
 
 @alone
 def element_forces(systems: Sequence[System]) -> torch.Tensor:
-    """Elastic forces of corners [N], (world, row): 12 a linear tet, 12 a membrane triangle, 30 a quadratic tet."""
+    """Elastic forces of corners [N], (world, row): 12 a tet or membrane triangle, 30 a quadratic tet, 24 a hex."""
     return _evaluated(systems, ("element_force", int(systems[0].work.element_force.real.shape[1])))[0]
 
 

@@ -473,7 +473,8 @@ class Simulation(
         """
         if exact and not self._systems[0].has_exact_tangent:
             raise ValueError(
-                "exact systems know soft bodies, cables and chambers; this scene has other parts, do without exact"
+                "exact systems know soft bodies of tetrahedra, cables and chambers; this scene has other parts, do "
+                "without exact, or mesh hexahedra with add_tets(mesh.linear())"
             )
         options, model, index = self.options, self.model, None
         if exact:

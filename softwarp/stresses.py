@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from softwarp import checks, diagnostics, interop
+from softwarp import checks, diagnostics, hex_tensors, interop
 from softwarp.kernels.elements import quadratic, tensors
 from softwarp.model.codes import TURNED
 from softwarp.model.fields import allocate
@@ -36,7 +36,8 @@ def von_mises(tensor: torch.Tensor) -> torch.Tensor:
 class ElementTensors:
     """Measures Cauchy stress and Green-Lagrange strain of all elements of a model; allocates once.
 
-    Those of a quadratic tet are the means of its four Gauss points, weighted with their volumes at rest.
+    Those of a quadratic tet are the means of its four Gauss points, weighted with their volumes at rest, those of a
+    hexahedron that of its mean deformation gradient.
 
     Args:
         model: Soft bodies.
@@ -65,6 +66,9 @@ class ElementTensors:
             whole = of_points.sum(dim=1)
             self._share = (of_points / whole[:, None])[None, :, :, None]
             volume = torch.cat([volume, whole])
+        if model.hexes is not None:
+            body = np.concatenate([body, model.hexes.layout.body])
+            volume = torch.cat([volume, wp.to_torch(model.hexes.hex_volume)])
         order = np.argsort(body, kind="stable")
         self.body = body[order]
         self._order = torch.as_tensor(order, device=wp.device_to_torch(device))
@@ -97,12 +101,15 @@ class ElementTensors:
                 wp.launch(kernel, dim, [q.element_node, state.node_x], [self._corner], device=m.device)
                 arrays = [q.point_tet, q.point_body, q.point_gradient]
                 self._evaluate(q.law_points, arrays, self._corner, parameters, self._points)
-        found = []
+            of_hexes = [] if m.hexes is None else hex_tensors.stress_and_strain(m, state, parameters)
+        found: list[torch.Tensor] = []
         for of_tets, of_points in zip(self._tets, self._points, strict=True):
             value = wp.to_torch(of_tets).unflatten(1, (m.tet_count, 9))
             if q is not None:
                 points = wp.to_torch(of_points).unflatten(1, (q.count, quadratic.POINTS, 9))
                 value = torch.cat([value, (points * self._share).sum(dim=2)], dim=1)
+            if of_hexes:
+                value = torch.cat([value, of_hexes[len(found)].flatten(2)], dim=1)
             found.append(value.index_select(1, self._order).unflatten(2, (3, 3)))
         return found[0], found[1]
 

@@ -117,6 +117,10 @@ def _parts(model: Model) -> Iterator[str]:
     """Parts by name."""
     if model.body_count == 0 and not model.has_moving_frames:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
+    if model.hexes is not None:
+        name = model.body_names[int(model.hexes.layout.body[0])]
+        told = f"hexahedra, those of body {name!r}, have no gradient yet"
+        yield f"{told}; mesh it with tetrahedra: add_tets(mesh.linear())"
     if model.frames is not None:
         yield from _frames(model, model.frames)
 

@@ -17,10 +17,12 @@ Floats = NDArray[np.float64]
 
 
 class InvertedElements:
-    """Finds the elements of a model with J <= 0, a quadratic one if it is so at any of its Gauss points."""
+    """Finds the elements of a model with J <= 0, a quadratic one if any of its Gauss points, a hexahedron by pieces."""
 
     def __init__(self, model: Model) -> None:
         self._tets = model.tet_node.numpy()
+        if model.hexes is not None:
+            self._tets = np.concatenate([self._tets, model.hexes.piece_node.numpy()])
         self._elements = np.zeros((0, 10), dtype=np.int32)
         if model.quadratic is not None:
             self._elements = model.quadratic.element_node.numpy()

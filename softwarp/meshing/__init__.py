@@ -9,6 +9,7 @@ from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
 from softwarp.meshing.finger_geometry import FingerMesh, finger
+from softwarp.meshing.hexes import HexMesh, brick, check_hexes, quad_shares
 from softwarp.meshing.lumen import Lumen
 from softwarp.meshing.maze_geometry import Maze, random_maze, serpentine
 from softwarp.meshing.nasal_geometry import nasal_passage
@@ -48,7 +49,7 @@ from softwarp.meshing.tets import (
     tet_volumes,
     weld,
 )
-from softwarp.meshing.tripod_geometry import tripod
+from softwarp.meshing.tripod_geometry import tripod, tripod_bricks
 from softwarp.meshing.trunk_geometry import round_trunk, trunk, trunk_skin
 
 __all__ = [
@@ -56,6 +57,7 @@ __all__ = [
     "CavityWall",
     "CupMesh",
     "FingerMesh",
+    "HexMesh",
     "Lumen",
     "Maze",
     "MembraneGeometry",
@@ -73,7 +75,9 @@ __all__ = [
     "as_surface",
     "board",
     "box",
+    "brick",
     "check_closed",
+    "check_hexes",
     "check_tets",
     "compact",
     "cup",
@@ -95,6 +99,7 @@ __all__ = [
     "orient",
     "orient_surface",
     "pad",
+    "quad_shares",
     "quadruped",
     "quadruped_skin",
     "radius_ratio",
@@ -114,6 +119,7 @@ __all__ = [
     "tetrahedralize",
     "triangle_areas",
     "tripod",
+    "tripod_bricks",
     "trunk",
     "trunk_skin",
     "union",

@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp.meshing.hexes import HexMesh
 from softwarp.meshing.prisms import cut_prisms, split_quads
 from softwarp.meshing.resolutions import check_name
 from softwarp.meshing.tets import FloatArray, TetMesh, orient
@@ -23,7 +24,9 @@ REACH = 0.055  # from the axis to the end of a leg
 THICKNESS = 0.005
 HOLE_RADIUS = 0.005
 SIDE = 0.5 * WIDTH / math.sqrt(3.0)  # from the axis to where a leg begins
+HELD = SIDE + (REACH - SIDE) * 5.0 / 6.0  # to the line from which the published mesh is held
 
+GRADING = 0.54  # of the lengths of hexahedra along a leg
 # Cells across a leg, along it, from the hole to the leg, and through the thickness. Multiples of the coarse mesh's six
 # keep a line of nodes at 47.3 mm, from where the legs of the published mesh are held.
 DETAILS = {"coarse": (4, 6, 1, 1), "medium": (6, 12, 1, 2), "fine": (10, 18, 2, 3)}
@@ -46,7 +49,9 @@ def tripod(resolution: str = "coarse") -> TetMesh:
     """
     check_name(resolution, DETAILS, "tripod")
     across, along, inwards, layers = DETAILS[resolution]
-    plane, triangles, rank = _plan(across, along, inwards)
+    strip = np.concatenate([_sector(across, inwards), _leg(across, np.linspace(SIDE, REACH, along + 1))])
+    plane, quads, rank = _plan(strip)
+    triangles = split_quads([tuple(quad) for quad in quads], rank)
     heights = np.linspace(-THICKNESS, 0.0, layers + 1)
     nodes = np.concatenate([np.column_stack([plane, np.full(len(plane), z)]) for z in heights])
     pair = np.arange(2 * len(plane))
@@ -54,10 +59,32 @@ def tripod(resolution: str = "coarse") -> TetMesh:
     return TetMesh(nodes, orient(nodes, np.concatenate(tets)), f"tripod {resolution}")
 
 
-def _plan(across: int, along: int, inwards: int) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Points of one layer (point, 2), triangles between them, and a rank that mirror images and legs share."""
-    strip = np.concatenate([_sector(across, inwards), _leg(across, along)])  # (row, across + 1, 2)
-    rows = len(strip)
+def tripod_bricks(across: int = 4, along: int = 6) -> HexMesh:
+    """The star of ``tripod`` in one layer of hexahedra, lower face first, which are shorter where legs bend most.
+
+    That is where they are held: arms that stand upright turn the legs' ends by a right angle, while the legs are
+    stretched. From there inwards cells grow to three times the length of the outermost one.
+
+    Args:
+        across: Cells across a leg.
+        along: Cells along it, up to where it is held.
+    """
+    place = np.linspace(0.0, 1.0, along + 1)
+    rows = SIDE + (HELD - SIDE) * place * (1.0 + GRADING * (1.0 - place))
+    strip = np.concatenate([_sector(across, 1), _leg(across, np.append(rows, REACH))])
+    plane, quads, _ = _plan(strip)
+    nodes = np.concatenate([np.column_stack([plane, np.full(len(plane), z)]) for z in (-THICKNESS, 0.0)])
+    hexes = np.concatenate([quads, quads + len(plane)], axis=1)
+    return HexMesh(nodes, hexes.astype(np.int32), "tripod walls")
+
+
+def _plan(strip: FloatArray) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    """Points of one layer (point, 2), cells between them (cell, 4), and a rank that mirror images and legs share.
+
+    Args:
+        strip: Points of the leg along +y and of the sector inwards of it, row by row outwards, (row, across + 1, 2).
+    """
+    rows, across = len(strip), strip.shape[1] - 1
     column = np.abs(2 * np.arange(across + 1) - across)
     rank = np.broadcast_to(np.arange(rows)[:, None] * (across + 1) + column, (rows, across + 1))
     points: list[FloatArray] = []
@@ -77,8 +104,7 @@ def _plan(across: int, along: int, inwards: int) -> tuple[FloatArray, NDArray[np
         (number[leg, r, c], number[leg, r, c + 1], number[leg, r + 1, c + 1], number[leg, r + 1, c])
         for leg, r, c in itertools.product(range(LEGS), range(rows - 1), range(across))
     ]
-    order = np.array(ranks)
-    return np.array(points), split_quads(quads, order), order
+    return np.array(points), np.array(quads), np.array(ranks)
 
 
 def _sector(across: int, inwards: int) -> FloatArray:
@@ -91,9 +117,9 @@ def _sector(across: int, inwards: int) -> FloatArray:
     return result
 
 
-def _leg(across: int, along: int) -> FloatArray:
-    """Points of the leg along +y from its beginning on, row by row outwards, (row, across + 1, 2)."""
-    x, y = np.linspace(-0.5 * WIDTH, 0.5 * WIDTH, across + 1), np.linspace(SIDE, REACH, along + 1)
+def _leg(across: int, y: FloatArray) -> FloatArray:
+    """Points of the leg along +y at distances y from the axis, row by row outwards, (row, across + 1, 2)."""
+    x = np.linspace(-0.5 * WIDTH, 0.5 * WIDTH, across + 1)
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
 
 

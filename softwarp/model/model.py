@@ -15,6 +15,7 @@ from softwarp.model.codes import ROW_ITEMS
 from softwarp.model.contact import ContactModel, check_capacity
 from softwarp.model.fields import shared
 from softwarp.model.frames import FrameModel
+from softwarp.model.hexes import HexModel
 from softwarp.model.joints import JointModel
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.model.reduction import ReductionModel
@@ -74,6 +75,7 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     joints: JointModel | None
     contact: ContactModel | None
     quadratic: QuadraticModel | None
+    hexes: HexModel | None
     reduction: ReductionModel | None
     telescopes: TelescopeModel | None
 
@@ -169,6 +171,11 @@ class Model(Unpicklable, instead="send the ModelBuilder that made it, and call f
     def quadratic_count(self) -> int:
         """Quadratic tets of all bodies."""
         return 0 if self.quadratic is None else self.quadratic.count
+
+    @property
+    def hex_count(self) -> int:
+        """Hexahedra of all bodies."""
+        return 0 if self.hexes is None else self.hexes.count
 
     @property
     def body_count(self) -> int:

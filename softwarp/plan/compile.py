@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from softwarp.plan.contact import contact_model, expected_contacts
 from softwarp.plan.fingerprint import fingerprint
 from softwarp.plan.frame_arrays import frame_model, master_dof_of, segment_elements
 from softwarp.plan.frames import FrameLayout, layout
+from softwarp.plan.hexes import hex_elements, hex_lists, hex_model
 from softwarp.plan.joints import JointLayout, joint_layout, joint_model
 from softwarp.plan.parameters import parameter_defaults
 from softwarp.plan.quadratic import entry_lists, inertia_lists, quadratic_elements, quadratic_model
@@ -181,6 +183,7 @@ def _model(scene: Scene, parts: _Layouts, found: Structure, contact_capacity: in
         joints=joint_model(scene, parts.joints, frames),
         contact=contact_model(scene, soft.nodes, soft.node_start, touch_dof, frames, frame_dof, contact_capacity),
         quadratic=quadratic_model(soft.quadratic, soft.nodes, found),
+        hexes=hex_model(soft.hexes, soft.nodes, found),
         reduction=reduction_model(
             scene, soft, arrays, parts.membranes, parts.points, parts.row_starts, parts.modes, found, touch_dof
         ),
@@ -216,9 +219,11 @@ def coupled(model: Model) -> Model:
         if law in model.law_tets:
             is_turned[model.law_tets[law].numpy()] = True
     elements = tet_elements(model.tet_corners, is_turned)
-    quadratic = model.quadratic
+    quadratic, hexes = model.quadratic, model.hexes
     if quadratic is not None:
         elements += quadratic_elements(quadratic.layout)
+    if hexes is not None:
+        elements += hex_elements(hexes.layout)
     points = Points(model.point_node.numpy(), model.point_weight.numpy(), model.point_anchor.numpy())
     chambers, starts, ties = model.cavities, model.cable_starts, np.empty((0, 2), dtype=np.int32)
     if chambers is not None:
@@ -239,5 +244,8 @@ def coupled(model: Model) -> Model:
     if quadratic is not None:
         inertia = inertia_lists(quadratic.layout, found, model.node_count)
         quadratic = replace(quadratic, **vars(entry_lists(found)), **vars(inertia))
-    other = replace(model, symbolic=found.symbolic, quadratic=quadratic, cavities=chambers, **found.model_arrays())
+    if hexes is not None:
+        hexes = replace(hexes, **vars(hex_lists(hexes.layout, found)))
+    parts: dict[str, Any] = {"quadratic": quadratic, "hexes": hexes, "cavities": chambers}
+    other = replace(model, symbolic=found.symbolic, **parts, **found.model_arrays())
     return upload(other, model.device, real_of(model.precision))

@@ -93,7 +93,8 @@ FRAMES = {
     "carried_slot": INT,
 }
 SURFACE = {"points": FLOAT, "triangles": INT, "node": INT, "weight": FLOAT}
-NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "symbolic")  # records hashed by name
+# Records hashed by name
+NAMED = ("frames", "cavities", "membranes", "joints", "contact", "quadratic", "hexes", "symbolic")
 SEGMENTS = {"seg_length": FLOAT, "seg_section": FLOAT, "seg_scale": FLOAT, "seg_rest": FLOAT}
 
 
@@ -108,6 +109,10 @@ def fingerprint(scene: Scene, model: Model, frames: FrameLayout | None) -> str:
     add(model, SOFT)
     if model.quadratic is not None:
         add(model.quadratic, {"nodes": INT})
+    if model.hexes is not None:
+        digest.update(b"hexes")
+        add(model.hexes, {"nodes": INT})
+        add(model.hexes.layout, {"thin": BOOL})
     for body in scene.bodies:
         if body.stiffness is not None:
             digest.update(body.stiffness.tobytes())

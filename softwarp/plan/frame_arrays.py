@@ -107,12 +107,12 @@ def segment_elements(f: FrameLayout | None) -> list[Elements]:
 def _carried_elements(found: Structure) -> tuple[dict[str, GatherLists], dict[str, GatherLists]]:
     """Blocks of A and nodes that elements with carried nodes give to, by kind.
 
-    Membranes look after theirs, and the blocks of turned quadratic elements are those of grips.
+    Membranes and hexahedra look after theirs, and the blocks of turned quadratic elements are those of grips.
     """
     carried: dict[str, GatherLists] = {}
     held: dict[str, GatherLists] = {}
     for kind, lists_of in found.lists.items():
-        if kind == "membrane":
+        if kind in ("membrane", "hex"):
             continue
         is_quadratic = kind in ("quadraticlarge", "quadraticstored")
         if lists_of.carried.target.size and kind != KIND:

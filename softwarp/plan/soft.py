@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from softwarp import meshing
 from softwarp.meshing.tets import rest_geometry
 from softwarp.model.codes import TURNED
+from softwarp.model.hexes import HexLayout
 from softwarp.model.quadratic import QuadraticLayout
 from softwarp.plan.frames import FrameLayout, guide_points
+from softwarp.plan.hexes import hex_elements, hex_layout
 from softwarp.plan.quadratic import by_law, quadratic_elements, quadratic_layout
 from softwarp.plan.structure import Elements, lists
 from softwarp.scene.parts import BodySpec, Scene
@@ -26,7 +28,7 @@ FloatArray = NDArray[np.float64]
 class SoftLayout:
     """Nodes and elements of all soft bodies. The last nodes are guides: waypoints of cables on rods and rigid bodies.
 
-    Points are embedded in ``carriers``: the linear tets, or those between the nodes of quadratic elements.
+    Points are embedded in ``carriers``: the linear tets, or those between the nodes of other elements.
     """
 
     nodes: FloatArray  # (node, 3)
@@ -46,6 +48,7 @@ class SoftLayout:
     node_volume: FloatArray
     node_load: FloatArray
     quadratic: QuadraticLayout
+    hexes: HexLayout
     reduced: NDArray[np.bool_]  # (node,) nodes that move in modes
 
 
@@ -56,11 +59,11 @@ def soft_layout(scene: Scene) -> SoftLayout:
     carrier_start = np.concatenate([[0], np.cumsum([len(b.mesh.tets) for b in bodies])]).astype(np.int32)
     nodes = stacked([*(b.nodes for b in bodies), guides], (0, 3), np.float64)
     carriers = stacked([b.mesh.tets + s for b, s in zip(bodies, node_start[:-1], strict=True)], (0, 4), np.int32)
-    own = [(i, b) for i, b in enumerate(bodies) if b.elements is None]
+    own = [(i, b) for i, b in enumerate(bodies) if b.is_linear]
     tets = stacked([b.tets + node_start[i] for i, b in own], (0, 4), np.int32)
     tet_body = np.repeat([i for i, _ in own], [len(b.tets) for _, b in own]).astype(np.int32)
     gradient, volume, frame = rest_geometry(nodes, tets)
-    quadratic = quadratic_layout(scene, node_start)
+    quadratic, hexes = quadratic_layout(scene, node_start), hex_layout(scene, node_start)
     volumes = [_lumped_volume(b, volume[tet_body == i]) for i, b in enumerate(bodies)]
     given = [_weights(b) for _, b in own]
     weight = stacked(given, (0,), np.float64)
@@ -68,6 +71,7 @@ def soft_layout(scene: Scene) -> SoftLayout:
     end = (0, len(guides))
     node_volume = np.pad(stacked(volumes, (0,), np.float64), end)
     node_volume += np.bincount(quadratic.nodes.ravel(), quadratic.lumped.ravel(), minlength=len(nodes))
+    node_volume += np.bincount(hexes.nodes.ravel(), hexes.lumped.ravel(), minlength=len(nodes))
     return SoftLayout(
         nodes=nodes,
         carriers=carriers,
@@ -86,6 +90,7 @@ def soft_layout(scene: Scene) -> SoftLayout:
         node_volume=node_volume,
         node_load=np.pad(stacked([b.load for b in bodies], (0, 3), np.float64), (end, (0, 0))),
         quadratic=quadratic,
+        hexes=hexes,
         reduced=np.pad(np.repeat([b.reduction is not None for b in bodies], np.diff(node_start)), end).astype(bool),
     )
 
@@ -101,8 +106,8 @@ def _lumped_volume(body: BodySpec, volume: FloatArray) -> FloatArray:
     count = len(body.mesh.nodes)
     if body.points is not None:
         return body.points.node_volume
-    if body.elements is not None:
-        return np.zeros(count)  # quadratic elements bring theirs
+    if not body.is_linear:
+        return np.zeros(count)  # other elements bring theirs
     if body.lumping == "uniform":
         return np.full(count, volume.sum() / count)
     shares = np.bincount(body.mesh.tets.ravel(), np.repeat(volume / 4.0, 4), minlength=count)
@@ -118,12 +123,13 @@ def tet_elements(tets: IntArray, is_turned: NDArray[np.bool_]) -> list[Elements]
 
 
 def soft_elements(soft: SoftLayout, frames: FrameLayout | None) -> list[Elements]:
-    """Linear and quadratic tets of all bodies, less those that one frame carries whole.
+    """Elements of all bodies, less those that one frame carries whole.
 
     These move as rigid bodies, against which an element has no stiffness: what they would add to A is zero. Forces,
     energies, stresses and masses are theirs as before.
     """
     parts = tet_elements(soft.tets, np.isin(soft.laws, TURNED)) + quadratic_elements(soft.quadratic)
+    parts += hex_elements(soft.hexes)
     return parts if frames is None else [part.chosen(~frames.carries_whole(part.corners)) for part in parts]
 
 
@@ -174,8 +180,9 @@ def soft_arrays(scene: Scene, soft: SoftLayout, thin: Sequence[Elements], node_v
     outer = [s + n for s, n in zip(surfaces, soft.node_start[:-1], strict=True)]
     corners = np.concatenate([soft.tets, *(part.corners for part in thin)]).ravel()
     used = np.flatnonzero(corners >= 0)
-    of_node = np.concatenate([corners[used], soft.quadratic.nodes.ravel()])
-    place = np.concatenate([used, corners.size + np.arange(soft.quadratic.nodes.size)])
+    others = np.concatenate([soft.quadratic.nodes.ravel(), soft.hexes.nodes.ravel()])
+    of_node = np.concatenate([corners[used], others])
+    place = np.concatenate([used, corners.size + np.arange(others.size)])
     corner_start, corner = lists(of_node, place, len(soft.nodes))
     guides = len(soft.nodes) - int(soft.node_start[-1])
     own = tuple(tuple(b.material.law_parameters) for b in scene.bodies)

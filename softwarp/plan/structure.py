@@ -15,7 +15,7 @@ from softwarp.plan.ordering import analyze
 
 IntArray = NDArray[np.int32]
 FloatArray = NDArray[np.float64]
-Kind = Literal["large", "stored", "quadraticlarge", "quadraticstored", "membrane", "segment"]
+Kind = Literal["large", "stored", "quadraticlarge", "quadraticstored", "hex", "membrane", "segment"]
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Elements:
 
     Attributes:
         kind: How they keep their stiffness.
-        corners: Their nodes as slots, -1 for none, shape (element, 4) or (element, 10).
+        corners: Their nodes as slots, -1 for none, shape (element, 4), (element, 8) or (element, 10).
         number: Numbers that codes of their blocks use, shape (element,).
     """
 

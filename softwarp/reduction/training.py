@@ -90,6 +90,9 @@ def train(
     checks.count(contact_modes, "contact_modes", low=0)
     seed, mirrored = checks.seed(seed), checks.flag(mirrored, "mirrored")
     _refuse_still(sim, number, motion, still)
+    if model.hexes is not None and (model.hexes.layout.body == number).any():
+        name = model.body_names[number]
+        raise ValueError(f"reduction.train: body {name!r} has hexahedra, which cannot be reduced yet; take tetrahedra")
     nodes = slice(int(model.body_node_start[number]), int(model.body_node_start[number + 1]))
     rest, held = model.node_rest[nodes], model.node_fixed[nodes]
     mass = sim.mass[0, nodes].double().cpu().numpy()

@@ -15,7 +15,7 @@ from softwarp.meshing import MeshError
 from softwarp.meshing.quadratic import POINTS
 from softwarp.model.handles import Rod, SoftBody
 from softwarp.scene.checks import Box, corners, factors, node_indices, vector
-from softwarp.scene.materials import Material
+from softwarp.scene.materials import Corotational, Material
 from softwarp.scene.parts import BodySpec, ContactSurface, FloatArray, IntArray, Scene
 
 ELEMENTS = ("p1", "p2")
@@ -47,35 +47,94 @@ def add_tets(
     if not isinstance(material, Material) or not material.law:
         told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
         raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
+    value = _density(density, total_mass, material, (quadratic or mesh).volume, label)
+    if quadratic is not None and lumping != "volume":
+        raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
+    given: dict[str, Any] = {
+        "mesh": mesh,
+        "material": material,
+        "density": value,
+        "lumping": lumping,
+        "rayleigh": damping,
+    }
+    given["relaxation"] = _relaxation(relaxation, label)
+    given["elements"] = None if quadratic is None else quadratic.elements
+    if stiffness is not None:
+        count = len(mesh.tets) if quadratic is None else len(quadratic.elements)
+        given["stiffness"] = _stiffness(stiffness, count, label, points=quadratic is not None)
+    return _append(scene, label, contact_surface, **given)
+
+
+def add_hexes(
+    scene: Scene,
+    nodes: ArrayLike | meshing.HexMesh,
+    hexes: ArrayLike | None,
+    *,
+    material: Material,
+    density: float | None,
+    total_mass: float | None,
+    lumping: Literal["volume", "uniform"],
+    rayleigh: tuple[float, float],
+    stiffness: ArrayLike | None = None,
+    name: str | None,
+    contact_surface: Any = None,
+    thin: bool = False,
+) -> SoftBody:
+    """Add a soft body of hexahedra with incompatible modes."""
+    label = scene.new_name(name, f"body{len(scene.bodies)}")
+    checks.choice(lumping, f"body {label!r}: lumping", ("volume", "uniform"))
+    damping = factors(rayleigh, f"body {label!r}: rayleigh")
+    if not isinstance(nodes, meshing.HexMesh):
+        if hexes is None:
+            raise ValueError(f"body {label!r}: hexes are missing; pass nodes and hexes, or a HexMesh")
+        nodes = meshing.HexMesh(nodes, hexes, label)  # type: ignore[arg-type]
+    _doubt_unit(nodes.bounds, label)
+    if not isinstance(material, Corotational) or material.method != "warped":
+        told = f"{type(material).__name__}({material.method!r})" if isinstance(material, Corotational) else material
+        raise ValueError(
+            f"body {label!r}: hexahedra know the law Corotational of method 'warped' only, got {told}; take that, or "
+            "tetrahedra: add_tets(mesh.linear(), ...)"
+        )
+    value = _density(density, total_mass, material, nodes.volume, label)
+    given: dict[str, Any] = {
+        "mesh": nodes.linear(),
+        "hexes": nodes.hexes,
+        "thin": bool(thin),
+        "material": material,
+        "density": value,
+        "lumping": lumping,
+    }
+    if stiffness is not None:
+        given["stiffness"] = _stiffness(stiffness, len(nodes.hexes), label)
+    return _append(scene, label, contact_surface, rayleigh=damping, relaxation=(0.0, 0.0), **given)
+
+
+def _append(scene: Scene, label: str, contact_surface: Any, *, mesh: meshing.TetMesh, **given: Any) -> SoftBody:
+    """Add a body that nothing holds or pulls at yet."""
+    count = len(mesh.nodes)
+    scene.bodies.append(
+        BodySpec(
+            name=label,
+            mesh=mesh,
+            fixed=np.zeros(count, dtype=bool),
+            locked=np.zeros((count, 3), dtype=bool),
+            load=np.zeros((count, 3)),
+            contact_surface=None if contact_surface is None else _contact_surface(contact_surface, mesh, label),
+            **given,
+        )
+    )
+    return SoftBody(len(scene.bodies) - 1)
+
+
+def _density(density: float | None, total_mass: float | None, material: Material, volume: float, label: str) -> float:
+    """Density of a body of some volume [m^3] that is given its density or its mass."""
     if density is None and total_mass is None:
         density = material.density
     if (density is None) == (total_mass is None):
         raise ValueError(f"body {label!r}: give exactly one of density [kg/m^3] and total_mass [kg]")
     given = density if density is not None else total_mass
     value = checks.number(given, f"body {label!r}: mass and density", above=0.0)
-    if density is None:
-        value /= (quadratic or mesh).volume
-    if quadratic is not None and lumping != "volume":
-        raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
-    count = len(mesh.nodes)
-    scene.bodies.append(
-        BodySpec(
-            name=label,
-            mesh=mesh,
-            material=material,
-            density=float(value),
-            lumping=lumping,
-            rayleigh=damping,
-            relaxation=_relaxation(relaxation, label),
-            fixed=np.zeros(count, dtype=bool),
-            locked=np.zeros((count, 3), dtype=bool),
-            load=np.zeros((count, 3)),
-            elements=None if quadratic is None else quadratic.elements,
-            stiffness=None if stiffness is None else _stiffness(stiffness, mesh, quadratic, label),
-            contact_surface=None if contact_surface is None else _contact_surface(contact_surface, mesh, label),
-        )
-    )
-    return SoftBody(len(scene.bodies) - 1)
+    return float(value if density is not None else value / volume)
 
 
 def _relaxation(value: Any, label: str) -> tuple[float, float]:
@@ -88,17 +147,14 @@ def _relaxation(value: Any, label: str) -> tuple[float, float]:
     return ratio, time
 
 
-def _stiffness(
-    value: ArrayLike, mesh: meshing.TetMesh, quadratic: meshing.QuadraticMesh | None, label: str
-) -> FloatArray:
-    """Factors of the modulus, (m,) of linear tets, (m, 4) of the Gauss points of quadratic ones."""
-    count = len(mesh.tets) if quadratic is None else len(quadratic.elements)
-    shapes = [(count,)] if quadratic is None else [(count,), (count, POINTS)]
+def _stiffness(value: ArrayLike, count: int, label: str, *, points: bool = False) -> FloatArray:
+    """Factors of the modulus, (m,) of elements, (m, 4) where they have Gauss points."""
+    shapes = [(count,), (count, POINTS)] if points else [(count,)]
     told = " or ".join(map(str, shapes))
     found = checks.array(
         value, f"body {label!r}: stiffness", *shapes, above=0.0, need=f"be positive and finite, of shape {told}"
     )
-    return np.repeat(found[:, None], POINTS, axis=1) if quadratic is not None and found.ndim == 1 else found
+    return np.repeat(found[:, None], POINTS, axis=1) if points and found.ndim == 1 else found
 
 
 def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSurface:

@@ -69,10 +69,17 @@ class BodySpec:
     locked: NDArray[np.bool_]  # (n, 3) single axes
     load: FloatArray  # (n, 3) [N]
     elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
+    hexes: IntArray | None = None  # (m, 8) hexahedra; the mesh then has the linear tets between their nodes
+    thin: bool = False  # hexahedra with the modes of walls
     contact_surface: ContactSurface | None = None  # what touches; None for the boundary of the mesh
-    stiffness: FloatArray | None = None  # factors of the modulus, (m,) of linear tets, (m, 4) of quadratic ones' points
+    stiffness: FloatArray | None = None  # factors of the modulus, (m,) of elements, (m, 4) of quadratic ones' points
     reduction: ReductionSpec | None = None  # modes that it moves in; None for node by node
     points: PointTets | None = None  # what stands for the elements of a reduced body once it is planned
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the tets of its mesh are its elements."""
+        return self.elements is None and self.hexes is None
 
     @property
     def nodes(self) -> FloatArray:
@@ -81,7 +88,7 @@ class BodySpec:
 
     @property
     def tets(self) -> IntArray:
-        """Linear tets that resist, (tet, 4); of quadratic elements those between their nodes, which do not."""
+        """Linear tets that resist, (tet, 4); of other elements those between their nodes, which do not."""
         return self.mesh.tets if self.points is None else self.points.tets
 
 

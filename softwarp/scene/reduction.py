@@ -52,6 +52,8 @@ def reduce(scene: Scene, body: int, reduction: Reduced, frame: str | None = None
     if not all(hasattr(reduction, name) for name in PARTS):
         advice = "Reduction.load(path) reads one from a file"
         raise TypeError(checks.refusal(f"{label}: reduction", "be a Reduction", reduction, advice))
+    if spec.hexes is not None:
+        raise ValueError(f"{label} has hexahedra, which cannot be reduced yet; take tetrahedra, or leave reduce out")
     made_of, ours = getattr(reduction, "element", "p1"), "p1" if spec.elements is None else "p2"
     if made_of != ours:
         raise ValueError(

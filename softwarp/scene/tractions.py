@@ -39,8 +39,11 @@ def add_traction(
         chosen = _listed(spec, faces, triangles, label)
     else:
         chosen = faces[_flags(spec, faces, box, where, label)]
-    middles = None if spec.elements is None else meshing.face_middles(spec.elements, chosen)
-    node, share = meshing.face_shares(spec.mesh.nodes, chosen, middles)
+    if spec.hexes is not None:
+        node, share = meshing.quad_shares(spec.mesh.nodes, spec.hexes, chosen)
+    else:
+        middles = None if spec.elements is None else meshing.face_middles(spec.elements, chosen)
+        node, share = meshing.face_shares(spec.mesh.nodes, chosen, middles)
     scene.tractions.append(TractionSpec(name=label, body=int(body), node=node, share=share, value=value))
     return Handle(len(scene.tractions) - 1)
 

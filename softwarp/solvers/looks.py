@@ -58,6 +58,8 @@ def least_radius(model: Model) -> float:
 def usual_edge(model: Model) -> float:
     """Edge of a regular tetrahedron with the median volume of the model's elements [m]."""
     whole = [] if model.quadratic is None else [model.quadratic.point_volume.numpy()]
+    if model.hexes is not None:
+        whole.append(model.hexes.piece_size.numpy())
     volume = np.abs(np.concatenate([model.tet_volume.numpy(), *whole]))
     return float(np.cbrt(6.0 * np.sqrt(2.0) * np.median(volume)))
 

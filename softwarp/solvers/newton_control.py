@@ -124,12 +124,17 @@ def rounding_force(model: Model) -> float:
     """Force imbalance [N] that rounding of the coordinates to the model's precision causes in tets and rod segments."""
     epsilon = 2.2e-16 if model.precision == "float64" else 1.2e-7
     square = 0.0
-    for array in (model.tet_volume, *(() if model.quadratic is None else (model.quadratic.point_volume,))):
+    volumes = [model.tet_volume]
+    if model.quadratic is not None:
+        volumes.append(model.quadratic.point_volume)
+    if model.hexes is not None:
+        volumes.append(model.hexes.piece_size)
+    for array in volumes:
         if array.size == 0:
             continue
         mu, lam = lame(model.defaults["youngs"].max(), model.defaults["nu"].max())
-        volumes = np.abs(array.numpy()).astype(np.float64)
-        square += float(((2.0 * mu + lam) ** 2 * 12.0 * volumes ** (2.0 / 3.0)).sum())
+        sizes = np.abs(array.numpy()).astype(np.float64)
+        square += float(((2.0 * mu + lam) ** 2 * 12.0 * sizes ** (2.0 / 3.0)).sum())
     if model.frames is not None and model.segment_count:
         f = model.frames
         area, length = f.seg_section.numpy()[:, 0].astype(np.float64), f.seg_length.numpy().astype(np.float64)

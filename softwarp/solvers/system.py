@@ -381,7 +381,7 @@ class System:
         s, m, w, y = self.shard, self.model, self.work, self.linear.y
         self.b_into_sides()
         self.multipliers.add_forces(y, f_scale)
-        forces = w.element_force.real.shape[1] if m.quadratic_count else 12 * m.tet_count
+        forces = w.element_force.real.shape[1] if m.quadratic_count or m.hex_count else 12 * m.tet_count
         inputs = [m.dof_count, m.node_count, m.dof_node, forces]
         inputs += [w.node_mass.S, w.node_external.S, s.input["v0"].S]
         inputs += [w.element_force.S, y.S, f_scale, 1.0 if inertia else 0.0]

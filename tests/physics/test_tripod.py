@@ -124,3 +124,13 @@ def test_a_mesh_file_lies_where_sofagym_has_it(tmp_path):
     placed, own = tripod_mesh(config), tripod_mesh(TripodSceneConfig())
     np.testing.assert_allclose(placed.nodes, own.nodes, atol=1e-9)
     assert [len(held_nodes(config, placed.nodes, servo)) for servo in range(SERVOS)] == [20, 20, 20]
+
+
+def test_walls_have_a_mesh_of_their_own():
+    """The accurate variant is one of hexahedra; other meshes and rotations are refused beside it."""
+    sim, _ = tripod(fidelity="accurate")
+    assert (sim.model.hex_count, sim.model.tet_count) == (96, 0)
+    with pytest.raises(ValueError, match="mesh of its own"):
+        TripodSceneConfig(element="walls", rotation="warped", mesh="medium")
+    with pytest.raises(ValueError, match="means element='walls'"):
+        TripodSceneConfig(fidelity="accurate", element="p2")

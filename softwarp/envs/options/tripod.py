@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from softwarp.envs.options import (
     Angle,
@@ -21,21 +23,23 @@ from softwarp.envs.options import (
     check_choice,
     check_options,
 )
+from softwarp.envs.options.fidelity import FidelityConfig
 
 SERVOS = 3
 RESOLUTIONS = ("coarse", "medium", "fine")
+ELEMENTS = ("p1", "p2", "walls")
 ROTATIONS = ("large", "polar", "warped")
 
 
 @dataclass(kw_only=True)
-class TripodSceneConfig:
+class TripodSceneConfig(FidelityConfig):
     """Options of the scene; the defaults are SofaGym's, but for the limits of its servos."""
 
     mesh: str = "coarse"  # "coarse", "medium", "fine", or a mesh file
     mesh_scale: Positive = 1.0  # metres per unit of a mesh file, which lies flat as SoftRobots': a leg along -y, z >= 0
     youngs: Modulus = 250.0e3  # Pa
     nu: PoissonRatio = 0.45
-    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
+    element: str = "p1"  # "p1" (SOFA's linear tetrahedra, too stiff), "p2" (quadratic ones) or "walls" (hexahedra)
     rotation: str = "large"  # "large" (SOFA's) or "polar"
     total_mass: Mass = 0.032  # kg
     lumping: str = "uniform"  # "uniform": the same mass on each node, of "p1"; "volume": by the volumes around it
@@ -51,10 +55,18 @@ class TripodSceneConfig:
     max_torque: HighLimit = 0.18  # N m, of a servo that stands still: 1.8 kg cm
     arm_mass: Mass = 0.01  # kg
 
+    ACCURATE: ClassVar[Mapping[str, Any]] = {"mesh": "coarse", "element": "walls", "rotation": "warped"}
+
     def __post_init__(self) -> None:
-        """Refuse impossible limits."""
+        """Refuse impossible limits, and hexahedra where there are none."""
         check_options(self)
-        check_choice(self, "element", ("p1", "p2"))
+        self.take_fidelity()
+        check_choice(self, "element", ELEMENTS)
+        if self.element == "walls" and (self.mesh != "coarse" or self.rotation != "warped"):
+            raise ValueError(
+                f"{type(self).__name__}: element='walls' has a mesh of its own (leave mesh 'coarse') and needs "
+                f"rotation='warped', got {self.mesh!r} and {self.rotation!r}; fidelity='accurate' chooses all three"
+            )
         check_choice(self, "rotation", ROTATIONS)
         check_choice(self, "lumping", ("uniform", "volume"))
         if not self.min_angle <= self.angle <= self.max_angle:

@@ -62,16 +62,7 @@ def build_tripod_scene(
         plate: Options of ``ModelBuilder.add_rigid`` for the plate; None makes a small one almost without mass in the
             middle of the star's upper face.
     """
-    mesh = tripod_mesh(config)
-    body = builder.add_tets(
-        mesh,
-        material=Corotational(config.youngs, config.nu, method=config.rotation),
-        element=cast('Literal["p1", "p2"]', config.element),
-        total_mass=config.total_mass,
-        lumping=cast('Literal["volume", "uniform"]', config.lumping if config.element == "p1" else "volume"),
-        rayleigh=config.rayleigh,
-        name="tripod",
-    )
+    body = add_star(config, builder)
     nodes = builder.bodies[body].mesh.nodes
     top = np.array([0.0, 0.0, HEIGHT])
     small: dict[str, Any] = {"shape": shapes.Box(PIN), "mass": PIN_MASS, "inertia": PIN_INERTIA, "pose": tuple(top)}
@@ -86,6 +77,18 @@ def build_tripod_scene(
         motors.append(motor)
     marker = builder.add_marker(middle, tuple(top), name="middle")
     return TripodScene(body, middle, tuple(bases), tuple(arms), tuple(motors), marker)
+
+
+def add_star(config: TripodSceneConfig, builder: ModelBuilder) -> SoftBody:
+    """The star itself, flat, of the configured elements."""
+    law = Corotational(config.youngs, config.nu, method=config.rotation)
+    given: dict[str, Any] = {"material": law, "total_mass": config.total_mass, "rayleigh": config.rayleigh}
+    given["name"] = "tripod"
+    if config.element == "walls":
+        return builder.add_hexes(tripod_walls(), thin=True, **given)
+    element = cast('Literal["p1", "p2"]', config.element)
+    lumping = cast('Literal["volume", "uniform"]', config.lumping if element == "p1" else "volume")
+    return builder.add_tets(tripod_mesh(config), element=element, lumping=lumping, **given)
 
 
 def _add_servo(config: TripodSceneConfig, builder: ModelBuilder, servo: int) -> tuple[RigidBody, RigidBody, Joint]:
@@ -124,6 +127,12 @@ def tripod_mesh(config: TripodSceneConfig) -> meshing.TetMesh:
     mesh = read_mesh(config.mesh, scale=config.mesh_scale)
     x, y, z = mesh.nodes.T
     return meshing.TetMesh(np.stack([x, -y, HEIGHT - z], axis=1), mesh.tets, name=Path(config.mesh).name)
+
+
+def tripod_walls() -> meshing.HexMesh:
+    """The generated hexahedra in their place."""
+    made = meshing.tripod_bricks()
+    return meshing.HexMesh(made.nodes + np.array([0.0, 0.0, HEIGHT]), made.hexes, made.name)
 
 
 def held_nodes(config: TripodSceneConfig, nodes: FloatArray, servo: int) -> NDArray[np.int64]:

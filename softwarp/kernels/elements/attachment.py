@@ -16,19 +16,12 @@ from softwarp.kernels.elements import corotational, stored
 
 
 @cache
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Gather kernels for blocks of A that frames take part in."""
+def functions(variant: Variant) -> SimpleNamespace:
+    """Blocks between what carries corners."""
     S = variant.S
-    real = variant.real
-    mul = variant.mul
-    world_fastest = variant.world_fastest
-    module = variant.module("attachment")
     a = algebra(variant)
     Matrix, rows, row_x, row_y, row_z = a.Matrix, a.rows, a.row_x, a.row_y, a.row_z
-    read_vector, add_vector, add_matrix = a.read_vector, a.add_vector, a.add_matrix
-    add, scaled, dot, cross, crossed, outer = a.add, a.scaled, a.dot, a.cross, a.crossed, a.outer
-    isotropic = corotational.kernels(variant).isotropic
-    read_block = stored.functions(variant).read_block
+    read_vector, cross, crossed = a.read_vector, a.cross, a.crossed
 
     @wp.func
     def transformed(K: Matrix, lever: wp.array2d(dtype=S), w: int, left: int, right: int):
@@ -39,6 +32,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if left >= 0:
             K = crossed(read_vector(lever, w, 3 * left), K)
         return K
+
+    return SimpleNamespace(transformed=transformed)
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Gather kernels for blocks of A that frames take part in."""
+    S = variant.S
+    real = variant.real
+    mul = variant.mul
+    world_fastest = variant.world_fastest
+    module = variant.module("attachment")
+    a = algebra(variant)
+    rows, row_x, row_y, row_z = a.rows, a.row_x, a.row_y, a.row_z
+    read_vector, add_vector, add_matrix = a.read_vector, a.add_vector, a.add_matrix
+    add, scaled, dot, outer = a.add, a.scaled, a.dot, a.outer
+    isotropic = corotational.kernels(variant).isotropic
+    read_block, transformed = stored.functions(variant).read_block, functions(variant).transformed
 
     @wp.kernel(module=module, enable_backward=False)
     def stored_stiffness(

@@ -22,19 +22,12 @@ LEAST = 1.0e-2  # bound of det(tr S 1 - S), which is 8 at rest: inverted element
 
 
 @cache
-def kernels(variant: Variant) -> SimpleNamespace:
-    """Force kernel of the warped tet for one scalar type; its tangent is that of ``corotational``."""
-    at, shared = access.functions(variant), corotational.force_kernels(variant)
-    inner = at.inner
-    S, T, real, world_fastest = variant.S, inner.S, variant.real, variant.world_fastest
-    mul, div = inner.mul, inner.div
-    module = variant.module("corotational.warped")
-    a, element_frame = algebra(inner), corotational.functions(inner).element_frame
+def functions(variant: Variant) -> SimpleNamespace:
+    """A step of the iteration for the rotation on the elements of a variant."""
+    T, real, mul, div = variant.S, variant.real, variant.mul, variant.div
+    a = algebra(variant)
     Matrix, Symmetric, rows, vector = a.Matrix, a.Symmetric, a.rows, a.vector
-    row_x, row_y, scaled, dot, apply = a.row_x, a.row_y, a.scaled, a.dot, a.apply
-    transposed, matmul, crossmul = a.transposed, a.matmul, a.crossmul
-    edges, gradients, of_body, of_tet, of_scene = at.edges, at.gradients, at.of_body, at.of_tet, at.of_scene
-    write_turned = shared.write_turned
+    scaled, dot, apply = a.scaled, a.dot, a.apply
 
     @wp.func
     def correction(m: Matrix):
@@ -66,6 +59,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
             vector(mul(p.y, t.x) + p.z, d + mul(p.y, t.y), mul(p.y, t.z) - p.x),
             vector(mul(p.z, t.x) - p.y, mul(p.z, t.y) + p.x, d + mul(p.z, t.z)),
         )
+
+    return SimpleNamespace(correction=correction)
+
+
+@cache
+def kernels(variant: Variant) -> SimpleNamespace:
+    """Force kernel of the warped tet for one scalar type; its tangent is that of ``corotational``."""
+    at, shared = access.functions(variant), corotational.force_kernels(variant)
+    inner = at.inner
+    S, T, real, world_fastest = variant.S, inner.S, variant.real, variant.world_fastest
+    mul = inner.mul
+    module = variant.module("corotational.warped")
+    a, element_frame = algebra(inner), corotational.functions(inner).element_frame
+    Matrix, Symmetric = a.Matrix, a.Symmetric
+    row_x, row_y = a.row_x, a.row_y
+    transposed, matmul, crossmul = a.transposed, a.matmul, a.crossmul
+    edges, gradients, of_body, of_tet, of_scene = at.edges, at.gradients, at.of_body, at.of_tet, at.of_scene
+    write_turned, correction = shared.write_turned, functions(inner).correction
 
     @wp.func
     def stress(m: Matrix, mu: T, lam: T):

@@ -71,7 +71,7 @@ def free_parts(model: Model) -> list[np.ndarray]:
 
     A part is a tree of the elimination, so that its last dof is the root.
     """
-    others = (model.quadratic, model.membranes, model.reduction, model.cavities, model.tractions)
+    others = (model.quadratic, model.hexes, model.membranes, model.reduction, model.cavities, model.tractions)
     if not model.tet_count or any(other is not None for other in others):
         return []
     node, parent = model.dof_node.numpy(), model.symbolic.parent

@@ -11,7 +11,7 @@ from softwarp.solvers.workspace.shard import Shard
 
 
 class InversionTerm(Term):
-    """Volume ratios of linear tetrahedra, and of quadratic ones at their Gauss points, where a step has led to."""
+    """Volume ratios where a step has led to: of linear tets, Gauss points of quadratic ones, pieces of hexahedra."""
 
     follows_paths = has_exact_tangent = True
 
@@ -34,6 +34,8 @@ class InversionTerm(Term):
             q = m.quadratic
             s.each(self.k_quadratic.point_corners, q.count, [q.element_node, w.x.S], [w.gauss_corner.S])
             self._look(quadratic.POINTS * q.count, q.point_tet, q.point_size, w.gauss_corner)
+        if m.hexes is not None:
+            self._look(m.hexes.piece_size.size, m.hexes.piece_node, m.hexes.piece_size, w.x)
 
     def _look(self, count: int, tet_node: wp.array, tet_size: wp.array, x: Rows) -> None:
         s, w = self.shard, self.shard.work

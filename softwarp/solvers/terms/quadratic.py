@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softwarp.kernels.elements import quadratic, stored
+from softwarp.kernels.elements import hexahedral, quadratic, stored
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.solvers.terms.term import Term, load_factor
 from softwarp.solvers.terms.tets import LinearTets, TetArrays
@@ -28,7 +28,8 @@ class QuadraticTerm(Term):
         self.k_stored = stored.kernels(shard.variant)
         self.k_turning = quadratic.turning_kernels(shard.variant)
         m, w = model, shard.work
-        self.first = w.element_force.real.shape[1] - 3 * quadratic.NODES * m.count
+        behind = 3 * hexahedral.CORNERS * shard.model.hex_count
+        self.first = w.element_force.real.shape[1] - 3 * quadratic.NODES * m.count - behind
         arrays = (m.point_tet, m.point_body, m.point_gradient, m.point_volume, m.point_frame)
         rows = (w.gauss_corner, w.gauss_force, w.gauss_gradient, w.gauss_stiffness, w.gauss_turning)
         self.points = LinearTets(shard, TetArrays(m.law_points, *arrays, m.point_size, *rows))

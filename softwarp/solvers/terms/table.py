@@ -7,6 +7,7 @@ from softwarp.solvers.terms.cables import CableTerm
 from softwarp.solvers.terms.cavities import CavityTerm
 from softwarp.solvers.terms.contact import ContactTerm
 from softwarp.solvers.terms.frames import FrameTerm
+from softwarp.solvers.terms.hexes import HexTerm
 from softwarp.solvers.terms.inversion import InversionTerm
 from softwarp.solvers.terms.joints import JointTerm
 from softwarp.solvers.terms.membranes import MembraneTerm
@@ -35,9 +36,11 @@ def terms_of(shard: Shard) -> tuple[Term, ...]:
         terms.append(MembraneTerm(shard, m.membranes))
     if m.quadratic is not None:
         terms.append(QuadraticTerm(shard, m.quadratic))
+    if m.hexes is not None:
+        terms.append(HexTerm(shard, m.hexes))
     if m.tractions is not None:
         terms.append(TractionTerm(shard, m.tractions))
-    if m.tet_count or m.quadratic is not None:
+    if m.tet_count or m.quadratic is not None or m.hexes is not None:
         terms.append(InversionTerm(shard))
     if m.reduction is not None:
         terms.append(ReductionTerm(shard, m.reduction))

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.elements import corotational, grip, norms, quadratic, samples, tensor_sums, turning
+from softwarp.kernels.elements import corotational, grip, hexahedral, norms, quadratic, samples, tensor_sums, turning
 from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.frames.tube_section import LAW_ROWS, PLAN_ROWS
 from softwarp.kernels.frames.windup import SYSTEM_ROWS
@@ -83,7 +83,7 @@ class Workspace:
     element_force: Rows = scratch(
         "element force",
         unit="N",
-        doc="dE/dx of corners: 12 a tet, then 12 a membrane triangle, then 30 a quadratic tet",
+        doc="dE/dx of corners: 12 a tet, then 12 a membrane triangle, 30 a quadratic tet, 24 a hexahedron",
     )
     tet_gradient: Rows = scratch("turned tet", corotational.TURNED_ROWS, doc="turned gradients of the corners")
     tet_stiffness: Rows = scratch("stored tet", 90, unit="N/m", doc="ten blocks K_ab, a >= b")
@@ -95,6 +95,12 @@ class Workspace:
     gauss_shape: Rows = scratch("turned Gauss point", 30, doc="turned gradients of the ten nodes' shape functions")
     grip: Rows = scratch("grip", grip.ROWS, doc="sums of these and of their moments over nodes that a frame carries")
     gauss_stiffness: Rows = scratch("stored Gauss point", 90, unit="N/m", doc="ten blocks of its linear tet")
+    hex_moduli: Rows = scratch("hex shape", 2, unit="Pa", doc="Lame constants of hex_stiffness")
+    hex_stiffness: Rows = scratch("hex shape", hexahedral.STORED_ROWS, unit="N/m", doc="K of a shape by rows")
+    hex_rotation: Rows = scratch(
+        "hex", 9, doc="rotation Q from the axes of the shape, times the root of the guard's factor"
+    )
+    hex_strain: Rows = scratch("hex", 24, unit="m", doc="displacements of corners in these axes, from the first")
     segment_force: Rows = scratch("segment", 12, unit="N", doc="force and moment [N m] of a rod segment on its ends")
     segment_damping: Rows = scratch("segment", 12, unit="N", doc="the same from beta K v")
     segment_stiffness: Rows = scratch("segment", 90, unit="N/m", doc="blocks as of a tet")
@@ -297,7 +303,11 @@ def counts(model: Model, exact: bool) -> dict[str, int]:
         "body": model.body_count + model.rod_count + model.rigid_count,
         "dof": model.dof_room,
         "block": len(model.symbolic.a_row),
-        "element force": 12 * (model.tet_count + triangles) + 3 * quadratic.NODES * model.quadratic_count,
+        "element force": 12 * (model.tet_count + triangles)
+        + 3 * quadratic.NODES * model.quadratic_count
+        + 3 * hexahedral.CORNERS * model.hex_count,
+        "hex": model.hex_count,
+        "hex shape": 0 if model.hexes is None else int(model.hexes.shape_body.size),
         "membrane tri": triangles,
         "Gauss point": points,
         "carried Gauss point": 0 if frames is None else points,

@@ -41,6 +41,15 @@ def test_solids_are_held_and_bent(name):
     assert (ways > 1e-3).all() and (ways < 0.3).all()
 
 
+def test_the_accurate_tripod_is_near_the_truth():
+    """Within 2 % of the limit of quadratic meshes, under loads that nothing was fitted to."""
+    robots = cli.script("benchmarks", "fidelity_robots")
+    tripod = robots.ROBOTS["Tripod"]
+    places, start = tripod.rest(tripod.variants["accurate"])
+    off = np.linalg.norm(places - start - tripod.truth, axis=1)
+    assert (off < 0.02 * np.linalg.norm(tripod.truth, axis=1)).all()
+
+
 @pytest.mark.slow  # 10 s; the coarsest of the meshes whose limit is taken for truth
 def test_parts_of_the_diamond_rest_where_the_whole_one_does():
     """Halves and quarters under loads as symmetric as they are."""

@@ -7,7 +7,7 @@ import pytest
 
 from softwarp import meshing
 from softwarp.meshing import MeshError
-from softwarp.meshing.tripod_geometry import DETAILS, HOLE_RADIUS, REACH, SIDE, THICKNESS, WIDTH
+from softwarp.meshing.tripod_geometry import DETAILS, HELD, HOLE_RADIUS, REACH, SIDE, THICKNESS, WIDTH
 
 RESOLUTIONS = ("coarse", "medium", "fine")
 
@@ -68,7 +68,23 @@ def test_quality(tripod):
 def test_legs_are_held_from_the_same_line_on(tripod):
     """The first line of nodes beyond 45 mm is at 47.3 mm in all resolutions, as in the published coarse mesh."""
     along = tripod.nodes[np.abs(tripod.nodes[:, 0]) <= 0.5 * WIDTH + 1e-9, 1]
-    assert along[along >= 0.045].min() == pytest.approx(SIDE + 5.0 / 6.0 * (REACH - SIDE), abs=1e-9)
+    assert along[along >= 0.045].min() == pytest.approx(HELD, abs=1e-9)
+
+
+def test_bricks_are_symmetric_and_held_from_the_same_line_on():
+    """One layer of the coarse mesh's outline; a third of a turn and the mirror permute nodes and hexahedra."""
+    bricks = meshing.tripod_bricks()
+    assert bricks.volume == pytest.approx(meshing.tripod("coarse").volume, rel=1e-12)
+    assert bricks.hexes.shape == (96, 8)
+    cos, sin = -0.5, math.sqrt(0.75)
+    third = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    for image in (third, np.diag([-1.0, 1.0, 1.0])):
+        apart = np.linalg.norm((bricks.nodes @ image.T)[:, None] - bricks.nodes[None], axis=-1)
+        assert apart.min(axis=1).max() < 1e-9
+        mapped = {tuple(h) for h in np.sort(apart.argmin(axis=1)[bricks.hexes], axis=1).tolist()}
+        assert mapped == {tuple(h) for h in np.sort(bricks.hexes, axis=1).tolist()}
+    along = bricks.nodes[np.abs(bricks.nodes[:, 0]) <= 0.5 * WIDTH + 1e-9, 1]
+    assert along[along >= 0.045].min() == pytest.approx(HELD, abs=1e-9)
 
 
 def test_unknown_resolution():
