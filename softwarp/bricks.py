@@ -44,7 +44,7 @@ class Bricks:
             hexes: Corners in the order of VTK, shape (m, 8): the lower face counter-clockwise from above, then the
                 upper one; omitted for a mesh.
             material: ``Corotational`` law of method ``warped``; the rotation is that of the mean deformation of an
-                element. Its guard against inversion does not act here.
+                element, and so is the volume ratio that its guard against inversion looks at.
             density: Density [kg/m^3]; exactly one of ``density`` and ``total_mass``, unless the material has one.
             total_mass: Mass of the body [kg].
             lumping: ``volume`` gives a node the integral of its shape functions, ``uniform`` the same mass to every

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from softwarp import interop
+from softwarp.kernels.elements.corotational import GUARD, GUARD_GROWTH
 from softwarp.model.hexes import HexModel
 from softwarp.model.model import Model
 from softwarp.model.state import Parameters, State
@@ -82,7 +83,21 @@ def energy(model: Model, state: State, parameters: Parameters) -> torch.Tensor:
     ratio = wp.to_torch(m.mode_ratio).double()[shape]
     mu, lam = mu[..., None], lam[..., None]
     total = total - ((mu * a + lam * b).square() / (mu + lam * ratio)).sum(dim=-1)
-    found: torch.Tensor = (0.5 * total * wp.to_torch(m.hex_factor).double()).to(x.dtype)
+    total = 0.5 * total + wp.to_torch(m.hex_volume).double() * _guard_density(model, m, x, mu[..., 0], lam[..., 0])
+    found: torch.Tensor = (total * wp.to_torch(m.hex_factor).double()).to(x.dtype)
+    return found
+
+
+def _guard_density(model: Model, m: HexModel, x: torch.Tensor, mu: torch.Tensor, lam: torch.Tensor) -> torch.Tensor:
+    """Energy of the guard per volume at rest [J/m^3], (world, hex); ``kernels.elements.energy`` has its terms."""
+    import torch
+
+    guard = wp.to_torch(model.body_guard).double()[wp.to_torch(m.hex_body).long()]
+    depth = (guard - torch.linalg.det(mean_gradient(m, x)).double()).clamp(min=0.0)
+    inner = torch.minimum(depth, guard.clamp(min=0.0))
+    square = 0.5 * inner.square() + 0.25 * GUARD_GROWTH * (inner / guard).square() * inner.square()
+    square = square + 0.5 * (1.0 + GUARD_GROWTH) * (depth.square() - inner.square())
+    found: torch.Tensor = GUARD * (lam + 2.0 * mu) * square
     return found
 
 

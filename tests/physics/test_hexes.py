@@ -129,6 +129,36 @@ def test_forces_are_those_of_an_energy_and_balance(rng: np.random.Generator) -> 
         assert slope == pytest.approx(float((force * direction).sum()), abs=1e-6 * size)
 
 
+def test_the_guard_has_an_energy_and_holds_elements_up(rng: np.random.Generator) -> None:
+    """Forces of crushed elements against differences; a confined brick under more than its modulus stays upright."""
+    mesh = irregular(rng)
+    sim = block(mesh)
+    x = mesh.nodes * [1.0, 1.0, 0.25] + 0.02 * SPACING * rng.uniform(-1.0, 1.0, mesh.nodes.shape)
+    move(sim, x)
+    force = sim.internal_force()[0].numpy().copy()
+    size = np.linalg.norm(force)
+    assert np.abs(np.cross(x, force).sum(axis=0)).max() < 1e-12 * size
+    direction, step, energy = rng.standard_normal(x.shape), 1e-7, []
+    for sign in (-1.0, 1.0):
+        move(sim, x + sign * step * direction)
+        energy.append(float(sim.elastic_energy()[0]))
+    assert (energy[1] - energy[0]) / (2.0 * step) == pytest.approx(float((force * direction).sum()), abs=1e-6 * size)
+
+    cube = meshing.brick((0.02, 0.02, 0.02), (1, 1, 1))
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = builder.add_hexes(cube, material=sw.Corotational(YOUNGS, 0.45), density=1000.0, rayleigh=(5.0, 0.01))
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-9)))
+    builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), axes="xy")
+    builder.add_traction(body, box=((-1.0, -1.0, 0.02 - 1e-9), (1.0, 1.0, 1.0)))
+    sim = sw.Simulation(builder.finalize(), dt=0.01)
+    for step in range(300):
+        sim.control.traction[:, 0, 2] = -180.0 / 0.02**2 * min(step / 200, 1.0)
+        sim.step()
+    assert int(sim.status[0]) == 0
+    assert int(sim.inverted_count[0]) == 0
+    assert float(sim.node_v.abs().max()) < 1e-2
+
+
 def test_tangent_is_that_of_held_rotations(rng: np.random.Generator) -> None:
     """At rest, turned: A is the derivative of the forces by differences, as nothing is left out without stress."""
     mesh = irregular(rng)

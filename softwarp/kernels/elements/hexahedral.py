@@ -7,7 +7,8 @@ u' K u / 2. Forces are those of this energy: with f = K u, t = sum y_a x f_a and
     f_a -> Q (f_a + g_a x h),
 
 where g_a are the mean gradients of the corners' functions, and what they add balances moments. The tangent Q K Q' keeps
-Q as it is. Reference: Taylor, Beresford, Wilson (1976), A non-conforming element for stress analysis.
+Q as it is. The guard of ``corotational`` acts on J = det F. Reference: Taylor, Beresford, Wilson (1976), A
+non-conforming element for stress analysis.
 """
 
 from functools import cache
@@ -65,12 +66,13 @@ def functions(variant: Variant) -> SimpleNamespace:
 def kernels(variant: Variant) -> SimpleNamespace:
     """Kernels of hexahedra for one scalar type."""
     S, real, world_fastest = variant.S, variant.real, variant.world_fastest
-    mul, div, any_positive, select = variant.mul, variant.div, variant.any_positive, variant.select
+    mul, div, sqrt, any_positive, select = variant.mul, variant.div, variant.sqrt, variant.any_positive, variant.select
     module = variant.module("hexahedral")
     a, f = algebra(variant), functions(variant)
     Vector, Matrix, Symmetric, rows = a.Vector, a.Matrix, a.Symmetric, a.rows
     row_x, row_y, row_z, transposed, matmul, crossmul = a.row_x, a.row_y, a.row_z, a.transposed, a.matmul, a.crossmul
     add, subtract, scaled, cross, matvec, apply = a.add, a.subtract, a.scaled, a.cross, a.matvec, a.apply
+    dot = a.dot
     read_vector, write_vector, add_vector, constant = a.read_vector, a.write_vector, a.add_vector, a.constant
     add_outer, add_matrix, write_matrix, combination = a.add_outer, a.add_matrix, a.write_matrix, a.combination
     element_frame = corotational.functions(variant).element_frame
@@ -201,17 +203,52 @@ def kernels(variant: Variant) -> SimpleNamespace:
     elif variant.lanes > 1:
         apply_stiffness = wide_hexes.apply_stiffness_of_lanes
 
+    @wp.func
+    def cofactor(M: Matrix):
+        """dJ/dM of J = det M."""
+        c = transposed(M)
+        return transposed(rows(cross(row_y(c), row_z(c)), cross(row_z(c), row_x(c)), cross(row_x(c), row_y(c))))
+
+    @wp.func
+    def guarded(depth: S, guard: S, C: Matrix, shape_gradient: wp.array2d(dtype=real), shape: int, corners: int):
+        """Root of the factor that the stiffness has where the volume ratio lies ``depth`` below the guard."""
+        one = S(real(1.0))
+        wider = S(real(0.0))
+        plain = S(real(0.0))
+        for m in range(corners):
+            g = constant(shape_gradient, shape, 3 * m)
+            slope = matvec(C, g)
+            wider += dot(slope, slope)
+            plain += dot(g, g)
+        relative = wp.min(div(depth, guard), one)
+        steep = one + mul(relative, relative) * real(3.0 * corotational.GUARD_GROWTH)
+        ramp = wp.min(depth * real(corotational.GUARD_RAMP), one)
+        widened = wp.max(div(wider, plain), one)
+        return sqrt(one + mul(mul(ramp, steep), widened) * real(corotational.GUARD_TANGENT))
+
+    @wp.func
+    def guard_pressure(depth: S, guard: S, mu: S, lam: S):
+        """dE/dJ per volume [Pa]: -k (lam + 2 mu) d (1 + 4 min(d / J0, 1)^2)."""
+        relative = wp.min(div(depth, guard), S(real(1.0)))
+        steep = depth + mul(depth, mul(relative, relative)) * real(corotational.GUARD_GROWTH)
+        return mul(steep, lam + mu + mu) * real(-corotational.GUARD)
+
     @wp.kernel(module=module, enable_backward=False)
     def hex_force(
         first: int,
         corners: int,
         # Model
         hex_node: wp.array2d(dtype=wp.int32),
+        hex_body: wp.array(dtype=wp.int32),
         hex_shape: wp.array(dtype=wp.int32),
         hex_factor: wp.array(dtype=real),
+        hex_volume: wp.array(dtype=real),
         shape_x: wp.array2d(dtype=real),
         shape_gradient: wp.array2d(dtype=real),
+        body_guard: wp.array(dtype=real),
         # Workspace in
+        body_mu_in: wp.array2d(dtype=S),
+        body_lam_in: wp.array2d(dtype=S),
         shape_stiffness_in: wp.array2d(dtype=S),
         node_x_in: wp.array2d(dtype=S),
         # Workspace out
@@ -219,7 +256,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         hex_strain_out: wp.array2d(dtype=S),
         element_force_out: wp.array2d(dtype=S),
     ):
-        """Elastic corner forces dE/dx [N], at rows ``first`` onwards, Q and u [m] of one hexahedron."""
+        """Elastic corner forces dE/dx [N], at rows ``first`` onwards, Q and u [m] of one hexahedron.
+
+        Q comes with the root of the factor that the guard gives the stiffness.
+        """
         w, hex = wp.tid()
         if wp.static(world_fastest):
             hex, w = wp.tid()
@@ -227,7 +267,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         F = mean_gradient(node_x_in, w, hex_node, hex, shape_gradient, shape, corners)
         Q = nearest_rotation(F)
         M = crossmul(Q, F)
-        write_matrix(hex_rotation_out, w, 9 * hex, Q)
         origin = read_vector(node_x_in, w, 3 * hex_node[hex, 0])
         strain = 24 * hex
         write_vector(hex_strain_out, w, strain, Vector())
@@ -244,10 +283,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
             torque = add(torque, cross(y, force))
         h = balance(M, torque)
         factor = S(hex_factor[hex])
+        body = hex_body[hex]
+        guard = S(body_guard[body])
+        C = cofactor(M)
+        depth = wp.max(S(real(0.0)), guard - dot(row_x(M), row_x(C)))
+        root = S(real(1.0))
+        pressure = S(real(0.0))
+        if any_positive(depth):
+            root = guarded(depth, guard, C, shape_gradient, shape, corners)
+            pressure = guard_pressure(depth, guard, body_mu_in[w, body], body_lam_in[w, body]) * hex_volume[hex]
+        P = rows(scaled(row_x(C), pressure), scaled(row_y(C), pressure), scaled(row_z(C), pressure))
+        write_matrix(
+            hex_rotation_out, w, 9 * hex, rows(scaled(row_x(Q), root), scaled(row_y(Q), root), scaled(row_z(Q), root))
+        )
         total = Vector()
         for m in range(1, corners):
-            turning = cross(constant(shape_gradient, shape, 3 * m), h)
-            force = matvec(Q, scaled(add(read_vector(element_force_out, w, out + 3 * m), turning), factor))
+            g = constant(shape_gradient, shape, 3 * m)
+            force = add(add(read_vector(element_force_out, w, out + 3 * m), cross(g, h)), matvec(P, g))
+            force = matvec(Q, scaled(force, factor))
             total = add(total, force)
             write_vector(element_force_out, w, out + 3 * m, force)
         write_vector(element_force_out, w, out, scaled(total, S(real(-1.0))))

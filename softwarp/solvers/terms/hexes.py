@@ -33,8 +33,9 @@ class HexTerm(Term):
     def forces(self) -> None:
         """Forces and rotations of all hexahedra."""
         s, m, w = self.shard, self.model, self.shard.work
-        inputs = [self.first, hexahedral.CORNERS, m.hex_node, m.hex_shape, m.hex_factor, m.shape_x, m.shape_gradient]
-        inputs += [w.hex_stiffness.S, w.x.S]
+        inputs = [self.first, hexahedral.CORNERS, m.hex_node, *self.elements, m.hex_volume]
+        inputs += [m.shape_x, m.shape_gradient, s.model.body_guard]
+        inputs += [w.body_mu.S, w.body_lam.S, w.hex_stiffness.S, w.x.S]
         s.each(self.k.hex_force, m.count, inputs, [w.hex_rotation.S, w.hex_strain.S, w.element_force.S])
 
     def tangent(self, h: float) -> None:

@@ -97,7 +97,9 @@ class Workspace:
     gauss_stiffness: Rows = scratch("stored Gauss point", 90, unit="N/m", doc="ten blocks of its linear tet")
     hex_moduli: Rows = scratch("hex shape", 2, unit="Pa", doc="Lame constants of hex_stiffness")
     hex_stiffness: Rows = scratch("hex shape", hexahedral.STORED_ROWS, unit="N/m", doc="K of a shape by rows")
-    hex_rotation: Rows = scratch("hex", 9, doc="rotation Q from the axes of the shape")
+    hex_rotation: Rows = scratch(
+        "hex", 9, doc="rotation Q from the axes of the shape, times the root of the guard's factor"
+    )
     hex_strain: Rows = scratch("hex", 24, unit="m", doc="displacements of corners in these axes, from the first")
     segment_force: Rows = scratch("segment", 12, unit="N", doc="force and moment [N m] of a rod segment on its ends")
     segment_damping: Rows = scratch("segment", 12, unit="N", doc="the same from beta K v")
