@@ -103,6 +103,12 @@ class ImplicitEuler:
                 wp.capture_if(control.left, partial(self._improve, control, iteration))
             else:
                 self._improve(control, iteration)
+        if control.best_contacts:
+            end = partial(control.find_best_contacts, self.h, self.pace.look)
+            if self.brief and not self.always:
+                wp.capture_if(control.left, end)
+            else:
+                end()
 
     def _evaluate(self, control: NewtonControl, iteration: int) -> None:
         """Forces, tangent and merit of an iterate."""

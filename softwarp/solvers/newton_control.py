@@ -24,7 +24,8 @@ class NewtonControl:
     Args:
         system: Worlds to iterate.
         still: Keep the forces of contacts of worlds that have converged, too, and what their sweeps left, so that
-            iterations of others change nothing there; their contacts are not worked on.
+            iterations of others change nothing there; their contacts are not worked on. Worlds that have not converged
+            get the contacts and forces of their best iterate, if ``find_best_contacts`` ends their iterations.
         deepest: How deep [m] contacts of each pair may lie at no cost to an iterate's merit, unless the start lies
             deeper, (pair,); contacts with compliance, and with None all, may lie anywhere.
 
@@ -47,6 +48,13 @@ class NewtonControl:
         self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
         worlds = (self.shard.variant, self.shard.world_count, 1, self.shard.device, wp.int32)
         self.spare = rows.allocate(*worlds)
+        self.best_contacts: list[tuple[rows.Rows, rows.Rows]] = []
+        if still and system.contact is not None:
+            d = system.contact.detector
+            for values in (d.known_count, d.known_key, d.known_force):
+                size, dtype = values.real.shape[1], values.real.dtype
+                best = rows.allocate(self.shard.variant, self.shard.world_count, size, self.shard.device, dtype)
+                self.best_contacts.append((values, best))
         self.idle = rows.allocate(*worlds) if system.contact is None else system.contact.contacts.idle
         count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
@@ -86,6 +94,17 @@ class NewtonControl:
         s.each_real(k.keep, s.dof_rows, [control, w.dof_v.real], [self.reference.real])
         s.each_real(k.keep_best, s.dof_rows, [last, control], [w.dof_v.real, self.best.real])
         s.each_real(k.keep_best, count, [last, control], [w.multiplier.real, self.best_multiplier.real])
+        if self.best_contacts and self.system.contact is not None:
+            known, best = zip(*self.best_contacts, strict=True)
+            outputs = [values.real for values in (*known, *best)]
+            s.each_real(k.keep_best_contacts, self.system.contact.contacts.capacity, [last, control], outputs)
+
+    def find_best_contacts(self, h: float, look: float) -> None:
+        """After the last iterate: contacts where worlds got their best, with the forces that it was judged with."""
+        assert self.system.contact is not None
+        self.system.move(h)
+        self.system.contact.find_kept(h, look)
+        self.hold_still()
 
     def look_for_others(self) -> None:
         """Whether there are worlds that have not converged, for ``left``; what converged ones are to keep."""

@@ -189,6 +189,34 @@ def kernels(variant: Variant) -> SimpleNamespace:
             value_out[pack, row, lane] = best_out[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def keep_best_contacts(
+        last: bool,
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        count_out: wp.array3d(dtype=wp.int32),
+        key_out: wp.array3d(dtype=wp.int32),
+        force_out: wp.array3d(dtype=real),
+        best_count_out: wp.array3d(dtype=wp.int32),
+        best_key_out: wp.array3d(dtype=wp.int32),
+        best_force_out: wp.array3d(dtype=real),
+    ):
+        """The same for one of the contacts that forces are known of: key and force, and how many there are."""
+        pack, c, lane = wp.tid()
+        if control_in[pack, wp.static(IMPROVED), lane] > real(0.5):
+            best_key_out[pack, c, lane] = key_out[pack, c, lane]
+            for i in range(3):
+                best_force_out[pack, 3 * c + i, lane] = force_out[pack, 3 * c + i, lane]
+            if c == 0:
+                best_count_out[pack, 0, lane] = count_out[pack, 0, lane]
+        elif last and control_in[pack, wp.static(FROZEN), lane] < real(0.5):
+            key_out[pack, c, lane] = best_key_out[pack, c, lane]
+            for i in range(3):
+                force_out[pack, 3 * c + i, lane] = best_force_out[pack, 3 * c + i, lane]
+            if c == 0:
+                count_out[pack, 0, lane] = best_count_out[pack, 0, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
     def go_back(
         # Workspace in
         control_in: wp.array3d(dtype=real),
@@ -334,6 +362,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         judge=judge,
         keep=keep,
         keep_best=keep_best,
+        keep_best_contacts=keep_best_contacts,
         go_back=go_back,
         check_direction=check_direction,
         drop_failed=drop_failed,

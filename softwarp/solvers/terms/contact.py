@@ -90,6 +90,12 @@ class ContactTerm(Term):
         if moving:
             self._rebase(h)
 
+    def find_kept(self, h: float, look: float) -> None:
+        """Contacts at the trial positions once more, with the forces that the detector knows."""
+        s = self.shard
+        self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], look, self.pairs)
+        self._rebase(h)
+
     def look(self, h: float, *, again: bool) -> Rows:
         """Distances less contact distances at the trial positions; what penetrates there unlisted is appended."""
         s, w, c, d = self.shard, self.shard.work, self.contacts, self.detector

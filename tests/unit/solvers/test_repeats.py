@@ -8,21 +8,30 @@ import pytest
 import torch
 
 import softwarp as sw
+from softwarp.kernels.step.newton import BEST, MERIT
 from softwarp.solvers import repeats
 from softwarp.solvers.repeats import RepeatingEuler
 
 THROWN = (2, 5)  # worlds
+LARGE = (0.01, 0.0125, 0.075)  # ball that a tube stays at
 SEEN = ("frame_pose", "frame_twist", "tube_length", "contact_key", "contact_force", "contact_load", "status", "time")
 
 
 def scene(
-    worlds: int, *, device: str = "cpu", path: str = "scalar", swing: float = 0.05, threads: int = 1
+    worlds: int,
+    *,
+    device: str = "cpu",
+    path: str = "scalar",
+    swing: float = 0.05,
+    threads: int = 1,
+    ball: tuple[float, float, float] = (0.005, 0.0075, 0.07),
 ) -> sw.Simulation:
-    """A tube beside a ball."""
+    """A tube beside a ball: its radius, x and z [m]."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     tube = sw.Tube([sw.TubeSection(0.1)], radius=1e-3, youngs=1e8)
     line = builder.add_telescope([tube], segments=8, lengths=(0.08,), contact_radius=2e-4, rayleigh=(0.0, 0.02))
-    builder.add_contact(line, builder.add_rigid(sw.Sphere(0.005), kinematic=True, pose=(0.0075, 0.001, 0.07)))
+    radius, x, z = ball
+    builder.add_contact(line, builder.add_rigid(sw.Sphere(radius), kinematic=True, pose=(x, 0.001, z)))
     model = builder.finalize(worlds, device)
     path = path if device == "cpu" else "auto"
     return sw.Simulation(model, dt=0.01, solver_path=path, threads=threads, repeat_swing=swing)  # type: ignore[arg-type]
@@ -52,8 +61,8 @@ def repeated(sim: sw.Simulation) -> list[int]:
 )
 def test_a_world_repeats_a_step_by_its_own_need(device: str, path: str) -> None:
     """Those that are pushed do so in the midst of others at rest, and all have the bits that they have alone."""
-    batch, *alone = (scene(worlds, device=device, path=path) for worlds in (9, 1, 1, 1))
-    plain = scene(9, device=device, path=path, swing=math.inf)
+    batch, *alone = (scene(worlds, device=device, path=path, ball=LARGE) for worlds in (9, 1, 1, 1))
+    plain = scene(9, device=device, path=path, swing=math.inf, ball=LARGE)
     for sim, worlds in zip((batch, plain, alone[0], alone[1]), (THROWN, THROWN, (0,), (0,)), strict=True):
         push(sim, worlds)
     told, contacts = [], 0
@@ -74,6 +83,35 @@ def test_a_world_repeats_a_step_by_its_own_need(device: str, path: str) -> None:
             if world not in THROWN:
                 assert torch.equal(state[world], plain.state_tensors()[name][world]), (name, world)
     assert not torch.equal(batch.frame_pose[2], plain.frame_pose[2])
+
+
+@pytest.mark.parametrize("iterations", [3, 6])
+def test_contacts_and_forces_are_those_of_the_iterate_that_stands(
+    monkeypatch: pytest.MonkeyPatch, iterations: int
+) -> None:
+    """A world whose iterations end without convergence has, with the contacts that it tells, its best imbalance."""
+    monkeypatch.setattr(repeats, "ITERATIONS", iterations)
+    monkeypatch.setattr(repeats, "TOLERANCE", 1e-12)
+    monkeypatch.setattr(repeats, "DEEP", 1e6)
+    sim = scene(1, ball=LARGE)
+    push(sim, (0,))
+    differ = 0
+    for _ in range(4):
+        sim.step()
+        newton, control = sim._steppers[0].places[0].newton, sim._steppers[0].places[0].control
+        newton.advance()
+        system, rows = control.system, control.system.work.control.real.numpy()[0, :, 0]
+        last = float(rows[MERIT])
+        assert system.contact is not None and system.contact.contacts.count.real.numpy().max() > 0
+        system.measure_rows()
+        system.forces()
+        system.tangent()
+        system.right_hand_side(newton.h, inertia=True, moving=True)
+        system.imbalance(newton.h, inertia=True)
+        found, scale = system.work.norm.real.numpy()[0, :2, 0]
+        assert found / scale == pytest.approx(float(rows[BEST]), rel=1e-6)
+        differ += last > 1.01 * float(rows[BEST])
+    assert differ > 0
 
 
 def test_worlds_that_repeat_side_by_side_keep_their_bits(monkeypatch: pytest.MonkeyPatch) -> None:
