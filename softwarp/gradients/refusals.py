@@ -20,10 +20,6 @@ class Diverged(RuntimeError):
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _reduced(sim), _contacts(sim))
-    is_linear = sim.options.newton_iterations == 1
-    if sim.options.pressure_tangent and is_linear and sim.model.joints is not None:
-        told = "the tangent of pressures has no gradient beside joints yet"
-        return f"{told}; take pressure_tangent=False"
     return next(parts, None)
 
 
