@@ -181,9 +181,9 @@ def test_both_modes_agree(beside: str, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("beside", ["ball", "branch"])
+@pytest.mark.parametrize("beside", ["ball", "branch", "graded"])
 def test_contacts_and_memories(beside: str, newton: bool) -> None:
-    """Beside contact with a ball, and with a Maxwell branch; cables stretch."""
+    """Beside contact with a ball, with a Maxwell branch, and with elements of other moduli, which masses are without."""
     leaf = torch.tensor(REST).requires_grad_()
     stepped(beam_beside(beside, newton, REST), START, leaf).backward()
     assert leaf.grad is not None
@@ -197,7 +197,10 @@ def beam_beside(beside: str, newton: bool, rest: np.ndarray, num_worlds: int = 1
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     memory = (0.3, 0.05) if beside == "branch" else (0.0, 0.0)
     mesh, stuff = replace(MESH, nodes=rest), material("large", 1e5, 0.4)
-    body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory)
+    factors = np.random.default_rng(3).uniform(0.7, 1.5, len(mesh.tets)) if beside == "graded" else None
+    body = builder.add_tets(
+        mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory, stiffness=factors
+    )
     builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
     if beside != "nothing":
         builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
