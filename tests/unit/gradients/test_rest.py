@@ -183,7 +183,7 @@ def test_both_modes_agree(beside: str, options: dict[str, Any]) -> None:
 @pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("beside", ["ball", "branch", "graded"])
 def test_contacts_and_memories(beside: str, newton: bool) -> None:
-    """Beside contact with a ball, with a Maxwell branch, and with elements of other moduli, which masses are without."""
+    """Beside contact with a ball, with a Maxwell branch, and with factors of moduli, which masses are without."""
     leaf = torch.tensor(REST).requires_grad_()
     stepped(beam_beside(beside, newton, REST), START, leaf).backward()
     assert leaf.grad is not None
