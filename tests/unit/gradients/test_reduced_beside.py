@@ -114,3 +114,17 @@ def test_worlds_beside_change_no_bit() -> None:
             for key, value in parts.items():
                 axis = int(group == "controls")
                 assert torch.equal(together[group][key].select(axis, world), value.select(axis, 0)), (group, key)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["euler", "bdf2"])
+def test_worlds_beside_change_no_bit_of_solved_steps(integrator: str) -> None:
+    """The slab alone: three worlds, and each by itself."""
+    batch, single = (test_reduced.slab(count, integrator=integrator, **SOLVED) for count in (3, 1))
+    given = test_reduced.given_of
+    together, rollout = gradients(Rollout(batch), given(batch, [1, 2, 3]), test_reduced.loss), Rollout(single)
+    for world, seed in enumerate((1, 2, 3)):
+        for group, parts in gradients(rollout, given(single, [seed]), test_reduced.loss).items():
+            for key, value in parts.items():
+                axis = test_reduced.axis_of(group, key)
+                assert torch.equal(together[group][key].select(axis, world), value.select(axis, 0)), (group, key)
