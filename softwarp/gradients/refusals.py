@@ -20,10 +20,6 @@ class Diverged(RuntimeError):
 def missing(sim: Simulation) -> str | None:
     """The first part of a scene, or option, whose steps have no gradient, and what to do instead; None if all have."""
     parts = itertools.chain(_options(sim), _parts(sim.model), _rods(sim), _reduced(sim), _contacts(sim))
-    is_linear = sim.options.newton_iterations == 1
-    if sim.options.pressure_tangent and is_linear and sim.model.joints is not None:
-        told = "the tangent of pressures has no gradient beside joints yet"
-        return f"{told}; take pressure_tangent=False"
     return next(parts, None)
 
 
@@ -162,11 +158,19 @@ def _reduced(sim: Simulation) -> Iterator[str]:
         parts = "rods, and rigid bodies that move or carry something"
         yield f"{told} in a floating frame beside {parts}, yet; train the reduction with frame='fixed'"
     if sim.options.newton_iterations > 1:
-        yield f"{told} with newton_iterations={sim.options.newton_iterations} yet; take newton_iterations=1"
+        count = sim.options.newton_iterations
+        if model.reduction.floating is not None:
+            yield f"{told} in a floating frame with newton_iterations={count} yet; take newton_iterations=1"
+        if model.contact is not None:
+            yield f"{told} beside contact with newton_iterations={count} yet; take newton_iterations=1"
+        if model.has_moving_frames or model.relaxes:
+            parts = "rods, moving rigid bodies and Maxwell branches"
+            yield f"{told} beside {parts} with newton_iterations={count} yet; take newton_iterations=1"
     if model.joints is not None:
         yield f"{told} beside joints yet; take the full mesh"
-    if model.relaxes:
-        yield f"{told} beside Maxwell branches yet; leave these out"
+    if model.relaxes and sim.options.integrator != "euler":
+        parts = f"Maxwell branches with integrator {sim.options.integrator!r}"
+        yield f"{told} beside {parts} yet; take integrator='euler', or leave these out"
 
 
 def _rods(sim: Simulation) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -88,10 +88,6 @@ class Rollout:
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         rest = checks.flag(rest, "gradients.Rollout: rest")
         require_differentiable(sim)
-        if rest and _carries_nodes(sim.model):
-            for part in _beside_carried(sim):
-                told = f"rest shapes have no gradient where rods or rigid bodies carry nodes beside {part} yet"
-                raise ValueError(f"gradients.Rollout: {told}; leave rest=True out")
         if rest and sim.model.reduction is not None:
             raise ValueError(
                 "gradients.Rollout: rest shapes have no gradient beside reduced bodies; leave rest=True out"
@@ -232,25 +228,6 @@ class Rollout:
         parts |= {"rod_x": pose[..., :3], "rod_q": pose[..., 3:], "rod_v": twist[..., :3], "rod_w": twist[..., 3:]}
         marked = self._markers(x, frames["frame_pose"] if model.has_moving_frames else None)
         return States(step, x, v, tension, pressure, marked, **parts)
-
-
-def _carries_nodes(model: Model) -> bool:
-    """Whether frames carry nodes of soft bodies or cables."""
-    frames = model.frames
-    return frames is not None and bool((frames.carried_slot.numpy() < model.node_count).any())
-
-
-def _beside_carried(sim: Simulation) -> Iterator[str]:
-    """What the levers of carried nodes have no gradient with."""
-    options = sim.options
-    if options.integrator != "euler":
-        yield f"integrator {options.integrator!r}"
-    if options.newton_iterations > 1:
-        yield f"newton_iterations={options.newton_iterations}"
-    if sim.model.relaxes:
-        yield "Maxwell branches"
-    if sim.model.contact is not None:
-        yield "contact"
 
 
 class _Steps(torch.autograd.Function):

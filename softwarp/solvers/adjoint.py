@@ -240,6 +240,9 @@ class StepAdjoint:
 
     def to_start(self, *, parameters: bool) -> None:
         """Gradients by positions, velocities and so on at the start of the step, from p and q of a solution."""
+        if self.contact is not None:
+            asked = parameters and self.rest is not None
+            self.contact.rest_bar = self.gradients.rest_x if asked else self.contact.no_rest
         self._to_elements(parameters=parameters)
         self._to_state()
         if self.frames is not None:

@@ -67,6 +67,7 @@ class ContactAdjoint:
         force: Gradients by the forces of contacts, in their axes.
         unsure: Not 0 in worlds whose equations have no solution, until somebody clears it.
         way: h H p of contacts and ``force``, which friction has a gradient by.
+        rest_bar: Receives gradients by the rest positions of nodes that something carries, if there is room for them.
     """
 
     forward = False  # whether the equations are those of changes of forces
@@ -95,6 +96,7 @@ class ContactAdjoint:
             self.matrix, self.held = (rows.allocate_whole(s.variant, s.world_count, n, s.device).real for n in sizes)
         else:
             self.matrix, self.held = (memory.zeros((worlds, n, 1), s.variant.real, s.device) for n in sizes)
+        self.no_rest = self.rest_bar = wp.zeros((1, 0), dtype=s.variant.real, device=s.device)
         self.is_new = True  # so that factors of the equations are to be found
 
     def _prepare_touches(self) -> None:
@@ -110,6 +112,8 @@ class ContactAdjoint:
         if frames is not None:
             kinematic[: frames.rigid_count] = frames.is_kinematic
         self.is_kinematic = wp.array(kinematic, dtype=wp.int32, device=s.device)
+        rest = np.zeros((1, 7)) if frames is None else frames.rest_pose
+        self.rest_pose = wp.array(rest, dtype=s.variant.real, device=s.device)
         self.look, self.u, self.normal = s.integers(self.contacts.capacity), s.work.dof_v, self.contacts.axes
         self.embedded = None
         if detector.embedded_count and not self.forward:
@@ -265,12 +269,12 @@ class ContactAdjoint:
 
     def _gather(self, motion: Any, outputs: list[wp.array], *, at_end: bool) -> None:
         c, s, d = self.contacts, self.shard, self.detector
-        inputs = [s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, motion]
+        inputs = [s.lanes, self.has_moving_frames, at_end, d.scene, self.top, self.is_kinematic, self.rest_pose, motion]
         inputs += [c.count.real, c.pair.real, c.key.real, d.couple.real, d.face.real]
         inputs += [c.multiplier.real, self.mode.real, self.way.real, self.parts.real]
         x_bar, v_bar, *others = outputs
         places = [x_bar, v_bar] if self.embedded is None else self.embedded.begin()
-        s.each_real(self.k_gather.gather, None, inputs, [*places, *others])
+        s.each_real(self.k_gather.gather, None, inputs, [*places, *others, self.rest_bar])
         if self.listed is not None and self.embedded is not None and not at_end:
             self.embedded.spread_listed(*self.listed)
         elif self.embedded is not None:

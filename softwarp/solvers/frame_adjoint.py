@@ -68,6 +68,7 @@ class FrameAdjoint:
         self.lifts = bool((slots < shard.model.body_node_count).any())
         self.impulse, self.stiff = (shard.rows(3 * max(nodes, 1)) for _ in range(2))
         self.offset, self.volume = shard.rows(3 * max(model.carried_count, 1)), shard.rows(max(nodes, 1))
+        self.no_memory = wp.zeros((1, 0, 1), dtype=shard.variant.real, device=shard.device)
         self.rest_pose = wp.array(model.rest_pose, dtype=shard.variant.real, device=shard.device)
         self.item_start, self.item = lists(model.carried_frame.numpy(), model.count, shard.device)
         self.segment_start, self.segment = lists(model.seg_rod.numpy(), model.rod_count, shard.device)
@@ -225,10 +226,15 @@ class FrameAdjoint:
             setattr(motion, name, part.real)
         inputs = [self.source_frame, m.source, m.source_lever, s.model.node_volume, s.model.node_body, m.frame_dof]
         inputs += [i["density"].real, w.body_mass.real, motion, i["v0"].real, node_v.real, node_p.real]
+        inputs += [w.compound.real, *self._share_of_memory()]
         s.each_real(self.k_lever.levers, self.source_frame.size, inputs, [self.offset.real, self.volume.real])
         inputs = [s.lanes, s.model.node_count, m.carried_slot, m.carried_frame, self.rest_pose]
         outputs = [self.gradients.rest_x, self.offset.real]
         s.each_real(self.k_lever.rest_carried, m.carried_count, inputs, outputs)
+
+    def _share_of_memory(self) -> list[wp.array]:
+        """Largest e of bodies and the memories of frames, if there are any."""
+        return [self.no_memory, self.no_memory]
 
     def to_parameters(self, p: Rows) -> None:
         """Add the gradients by parameters and gravity; needs ``to_state``."""

@@ -85,7 +85,7 @@ class LeaningFrames(FrameAdjoint):
         inputs += [self.pose.real, w.body_damping.real, w.dof_v.real, self.start_v.real, self.lean.real, p.real]
         inputs += [w.point_gradient.real, w.multiplier.real, q.real]
         inputs += [node_bar.real, self.impulse.real, self.stiff.real]
-        outputs = [g.node_x, g.node_v, g.command_node_force, self.items.real, self.felt.real]
+        outputs = [g.node_x, g.node_v, g.command_node_force, self.items.real, self.felt.real, self.offset.real]
         s.each_real(self.k_felt.carried_gradients, m.carried_count, inputs, outputs)
 
     def to_state(self, p: Rows) -> None:
@@ -123,6 +123,11 @@ class LeaningFrames(FrameAdjoint):
         outputs = [g.frame_pose, g.frame_twist, g.command_frame_force, g.command_body_velocity]
         outputs += [self.mind.real, self.ahead.real]
         s.each_real(self.k_felt.frame_gradients, m.count, inputs, outputs)
+
+    def _share_of_memory(self) -> list[wp.array]:
+        if self.term is None:
+            return super()._share_of_memory()
+        return [self.term.lean_share.real, self.shard.input["frame_memory"].real]
 
     def _to_sources(self, p: Rows) -> None:
         """Add what parts of compounds have by the share of memories in momentum."""

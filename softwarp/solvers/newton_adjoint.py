@@ -56,6 +56,7 @@ class NewtonAdjoint(StageAdjoint):
         self.found_v = s.rows(s.dof_room)
         self.given, self.total = s.rows(s.dof_rows), s.rows(s.dof_rows)
         self.start_frames = s.rows(6 * max(self.model.frame_count, 1))
+        self.start_offset = s.rows(1 if self.frames is None else self.frames.offset.real.shape[1])
         self.control = s.rows(newton_adjoint.ROWS)
         self.sooner = s.rows(s.dof_rows)
         if self.contact is not None:
@@ -104,6 +105,7 @@ class NewtonAdjoint(StageAdjoint):
             self.joints.begin(self.seed)
         if self.frames is not None:
             self.start_frames.copy_from(self.frames.start)
+            self.start_offset.copy_from(self.frames.offset)
         self.given.copy_from(self.seed)
         self.total.copy_from(self.seed)
         self.control.zero()
@@ -143,6 +145,7 @@ class NewtonAdjoint(StageAdjoint):
             self.shard.add(self.total, y, self.shard.dof_rows)
         if isinstance(self.frames, LeaningFrames):
             self.frames.start.copy_from(self.start_frames)
+            self.frames.offset.copy_from(self.start_offset)
             self.frames.turn_seed(self.seed, y, self.solved_v)
             self.shard.work.dof_v.copy_from(self.solved_v)
         self.p.zero()

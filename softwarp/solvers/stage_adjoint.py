@@ -168,7 +168,8 @@ class StageAdjoint(StepAdjoint):
                 f = self.frames
                 inputs = [m.node_count, f.item_start, f.item, f.model.carried_slot, f.model.carried_offset]
                 inputs += [x.node_point_start, x.node_point, x.node_point_weight, i["pose0"].real]
-                s.each_real(self.k_stage.start_frames, f.model.count, [*inputs, self.start_point.real], [f.start.real])
+                outputs = [f.start.real, f.offset.real]
+                s.each_real(self.k_stage.start_frames, f.model.count, [*inputs, self.start_point.real], outputs)
         inputs = [m.corner_start, m.corner, x.node_point_start, x.node_point, x.node_point_weight]
         inputs += [self.corner.S, self.point.S]
         s.each(self.k.node_sums, s.variant.parts(m.node_count), inputs, [self.node_bar.S])

@@ -140,7 +140,7 @@ class TrapezoidalAdjoint(SecondOrderAdjoint):
             return
         s, g = self.stepper.shard, self.gradients
         inputs = [s.model.node_count, model.frame_master, model.frame_offset, of_stage.item_start, of_stage.item]
-        inputs += [model.carried_slot, model.carried_offset, *(arrays[name] for name in FRAMES)]
-        bars = [g.node_x, g.node_v, *(getattr(g, name) for name in FRAMES)]
+        inputs += [model.carried_slot, model.carried_offset, of_stage.rest_pose, *(arrays[name] for name in FRAMES)]
+        bars = [g.node_x, g.node_v, *(getattr(g, name) for name in FRAMES), g.rest_x]
         worlds = g.frame_pose.shape[0]
         wp.launch(self.k_frames.take_carried, dim=(worlds, model.count), inputs=inputs, outputs=bars, device=s.device)

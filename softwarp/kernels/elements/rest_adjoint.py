@@ -188,6 +188,7 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         mass = of_mass(
             tet_node, gravity_in, node_v0_in, node_v_in, node_p_in, by_volume_in, pack, lane, tet, density, scale, h
         )
+        mass *= wp.dot(E[0], wp.cross(E[1], E[2])) / (real(6.0) * tet_volume[tet])  # which factors of moduli are not in
         D, b, c = pull(F, p, X, Y, e, g, E, B, mass, tet_volume[tet], h, k)
         b += D * gradient_at(tet_gradient, tet, 0)
         c += D * gradient_at(tet_gradient, tet, 1)

@@ -199,6 +199,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         frame_item: wp.array(dtype=wp.int32),
         carried_slot: wp.array(dtype=wp.int32),
         carried_offset: wp.array2d(dtype=real),
+        rest_pose: wp.array2d(dtype=real),
         # State
         pose_in: wp.array2d(dtype=real),
         twist_in: wp.array2d(dtype=real),
@@ -207,8 +208,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v_bar_out: wp.array2d(dtype=real),
         pose_bar_out: wp.array2d(dtype=real),
         twist_bar_out: wp.array2d(dtype=real),
+        rest_bar_out: wp.array2d(dtype=real),
     ):
         """Add what is by the nodes and frames that one frame carries to what is by its pose and twist, and leave 0.
+
+        By the rest positions of nodes, too, which have their levers from these.
 
         After an extrapolation these are where the frame is, whatever the stage before has led them to.
         """
@@ -245,6 +249,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
         for i in range(frame_item_start[frame], frame_item_start[frame + 1]):
             slot = carried_slot[frame_item[i]]
             if slot < nodes:
+                if rest_bar_out.shape[1] > 0:
+                    by_v = of_world(v_bar_out, world, 3 * slot)
+                    by_r = of_world(x_bar_out, world, 3 * slot)
+                    by_r += wp.cross(by_v, of_world(twist_in, world, 6 * frame + 3))
+                    at_rest = quat(rest_pose[frame, 3], rest_pose[frame, 4], rest_pose[frame, 5], rest_pose[frame, 6])
+                    by_r = wp.quat_rotate(at_rest, wp.quat_rotate_inv(q, by_r))
+                    for c in range(3):
+                        rest_bar_out[world, 3 * slot + c] = rest_bar_out[world, 3 * slot + c] + by_r[c]
                 for c in range(3):
                     x_bar_out[world, 3 * slot + c] = real(0.0)
                     v_bar_out[world, 3 * slot + c] = real(0.0)

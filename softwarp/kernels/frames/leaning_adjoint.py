@@ -35,7 +35,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("adjoint.leaning")
     one = single.functions(variant)
     vec3, vector_at, quat_at = one.vec3, one.vector_at, one.quat_at
-    quat, inertia_at, put, exponential = one.quat, one.inertia_at, one.put, one.exponential
+    quat, inertia_at, put, add_to, exponential = one.quat, one.inertia_at, one.put, one.add_to, one.exponential
     compounds = of_compounds(variant)
     turned, momentum = compounds.turned, compounds.momentum
     turns = of_frames.functions(variant)
@@ -211,6 +211,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         item_out: wp.array3d(dtype=real),
         felt_out: wp.array3d(dtype=real),
+        offset_out: wp.array3d(dtype=real),
     ):
         """As ``adjoint.carried_gradients``; ``felt`` has the gradients by velocities of the start and of the memory."""
         pack, item, lane = wp.tid()
@@ -220,7 +221,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
             return
         frame = carried_frame[item]
         s = 3 * frame_dof[2 * frame + 1]
-        r = wp.quat_rotate(quat_at(pose_in, pack, lane, 7 * frame + 3), offset_of(carried_offset, item))
+        q = quat_at(pose_in, pack, lane, 7 * frame + 3)
+        r = wp.quat_rotate(q, offset_of(carried_offset, item))
         w = vector_at(v_in, pack, lane, s)
         w0 = vector_at(start_v_in, pack, lane, s)
         tense = vec3()
@@ -239,6 +241,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         place = vector_at(node_bar_in, pack, lane, 3 * node)
         lever = wp.cross(tense, vector_at(p_in, pack, lane, s)) - wp.cross(bound, w - w0)
         lever -= wp.cross(stiff, w - (real(1.0) - d) * w0 + d * vector_at(lean_in, pack, lane, s))
+        add_to(offset_out, pack, lane, 3 * item, wp.quat_rotate_inv(q, place + lever))
         put(item_out, pack, lane, 12 * item, place)
         put(item_out, pack, lane, 12 * item + 3, wp.cross(r, place + lever))
         put(item_out, pack, lane, 12 * item + 6, -bound - stiff)

@@ -12,6 +12,7 @@ import warp as wp
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.frames import parameter_adjoint
+from softwarp.kernels.frames.inertia import COMPOUND_ROWS
 from softwarp.kernels.frames.parameter_adjoint import MOVED_ROWS
 
 
@@ -22,7 +23,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("adjoint.levers")
     one, f = single.functions(variant), parameter_adjoint.functions(variant)
     vec3, mat33, quat, vector_at, quat_at = one.vec3, one.mat33, one.quat, one.vector_at, one.quat_at
-    put, add_to = one.put, one.add_to
+    put, add_to, inertia_at = one.put, one.add_to, one.inertia_at
     turned, momentum, of_share = f.turned, f.momentum, f.of_share
 
     @wp.struct
@@ -70,13 +71,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v0_in: wp.array3d(dtype=real),
         node_v_in: wp.array3d(dtype=real),
         node_p_in: wp.array3d(dtype=real),
+        compound_in: wp.array3d(dtype=real),
+        lean_in: wp.array3d(dtype=real),
+        memory_in: wp.array3d(dtype=real),
         # Workspace out
         offset_out: wp.array3d(dtype=real),
         volume_out: wp.array3d(dtype=real),
     ):
         """Add what the mass of one carried node has by its lever; what it has by its volume, per density.
 
-        Of the latter that is left out which elements count for it, as for every node: p.(v0 - scale v).
+        Of the latter that is left out which elements count for it, as for every node: p.(v0 - scale v). Where there are
+        memories, their share e m' / m in momentum follows the mass, too.
         """
         pack, item, lane = wp.tid()
         if source[item, 0] == 0:
@@ -90,6 +95,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
             J = wp.dot(x, x) * wp.identity(n=3, dtype=real) - wp.outer(x, x)
             whole = worth(motion, pack, lane, frame, t, r, real(1.0), x, J, scale)
             row = 3 * node
+            k = wp.static(COMPOUND_ROWS) * frame
+            m = compound_in[pack, k, lane]
+            if lean_in.shape[1] > 0 and m > real(0.0):
+                q = quat_at(motion.pose0, pack, lane, 7 * frame + 3)
+                s = wp.quat_rotate(q, vector_at(compound_in, pack, lane, k + 1))
+                J0 = turned(q, inertia_at(compound_in, pack, lane, k + 4))
+                P, L = momentum(m, s, J0, vector_at(motion.p, pack, lane, t), vector_at(motion.p, pack, lane, r))
+                share = wp.dot(P, vector_at(memory_in, pack, lane, 6 * frame))
+                share += wp.dot(L, vector_at(memory_in, pack, lane, 6 * frame + 3))
+                share *= lean_in[pack, lean_in.shape[1] - 1, lane] / m
+                whole += (scale - compound_in[pack, k + 10, lane] / m) * share
             change = vector_at(v0_in, pack, lane, row) - scale * vector_at(node_v_in, pack, lane, row)
             volume_out[pack, node, lane] = whole - wp.dot(vector_at(node_p_in, pack, lane, row), change)
             by_x = vec3()

@@ -127,9 +127,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pack, dof, lane = wp.tid()
         slot = dof_node[dof]
         for c in range(3):
+            y = real(0.0)  # of modes
             if slot < node_count:
                 y = lean_in[pack, node_body[slot], lane] * node_memory_in[pack, 3 * slot + c, lane]
-            else:
+            elif 3 * (slot - node_count) + c < frame_memory_in.shape[1]:
                 y = lean_in[pack, bodies, lane] * frame_memory_in[pack, 3 * (slot - node_count) + c, lane]
             dof_v_out[pack, 3 * dof + c, lane] = dof_v_in[pack, 3 * dof + c, lane] + y
 

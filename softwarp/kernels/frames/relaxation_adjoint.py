@@ -61,7 +61,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             value = real(0.0)
             if slot < node_count:
                 value = h * keep_in[pack, node_body[slot], lane] * node_bar_in[world, 3 * slot + c]
-            else:
+            elif 3 * (slot - node_count) + c < frame_bar_in.shape[1]:  # else it is of modes
                 row = 3 * (slot - node_count) + c
                 value = h * keep_in[pack, bodies, lane] * frame_bar_in[world, row]
                 bare_out[pack, row, lane] = bare_out[pack, row, lane] + value

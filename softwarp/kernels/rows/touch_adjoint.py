@@ -24,7 +24,7 @@ from softwarp.model.codes import Carrier, CoupleColumn, Target
 
 # Parts of a contact: two points of its feature, three of a face, the shape; and the rows of each
 PARTS, SHAPE = 6, 5
-PLACE, TURN, ARM, WEIGHT, PART_ROWS = 0, 3, 6, 9, 10
+PLACE, TURN, ARM, LEVER, WEIGHT, PART_ROWS = 0, 3, 6, 9, 12, 13  # LEVER: by where a frame carries it
 PUSH, BOUNCE, INSET = PARTS * PART_ROWS, PARTS * PART_ROWS + 3, PARTS * PART_ROWS + 6
 AHEAD = PARTS * PART_ROWS + 9
 ROWS = AHEAD + 1  # of a contact: its parts, z, by the velocity before, by the inset of its feature, by u along n
@@ -289,7 +289,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     touch_of, touch_sum = sums.touch_of, sums.touch_sum
     meeting_of = forms.finders(real).meeting_of
     own = functions(variant)
-    Topology, Contact, Fields, Law = own.Topology, own.Contact, own.Fields, own.Law
+    Topology, Contact, Fields, Part, Law = own.Topology, own.Contact, own.Fields, own.Part, own.Law
     sides_of, levered, velocity, by_arm, by_weight = (
         own.sides_of,
         own.levered,
@@ -425,13 +425,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.func
     def put_part(
-        rows_out: wp.array3d(dtype=real), c: Contact, row: int, place: vec3, turn: vec3, arm: vec3, weight: real
+        rows_out: wp.array3d(dtype=real), c: Contact, row: int, part: Part, place: vec3, turn: vec3, lever: vec3
     ):
         """Write the rows of a part."""
         put(rows_out, c.pack, c.lane, row + wp.static(PLACE), place)
         put(rows_out, c.pack, c.lane, row + wp.static(TURN), turn)
-        put(rows_out, c.pack, c.lane, row + wp.static(ARM), arm)
-        rows_out[c.pack, row + wp.static(WEIGHT), c.lane] = weight
+        put(rows_out, c.pack, c.lane, row + wp.static(ARM), part.weight * part.arm)
+        put(rows_out, c.pack, c.lane, row + wp.static(LEVER), lever)
+        rows_out[c.pack, row + wp.static(WEIGHT), c.lane] = part.weight
 
     @wp.kernel(module=module, enable_backward=False)
     def parts(
@@ -556,6 +557,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 arm = by_arm(h, law, t.n, fields, c, part)
                 place = vec3()
                 turn = vec3()
+                lever = vec3()
                 if k == wp.static(SHAPE):
                     place, turn = shape_bar(m, found, part.origin)
                     place -= arm
@@ -566,6 +568,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         place += carriers
                     if part.frame >= 0:
                         turn = wp.cross(part.x - part.origin, place)
+                        lever = place
                         place -= arm
                     if part.is_node == 0:
                         place += carriers
@@ -574,15 +577,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                             if m.feature.rim != 0:
                                 place += found.feature.a1
                                 turn += wp.cross(m.feature.a1 - part.origin, found.feature.a1)
-                put_part(
-                    rows_out,
-                    c,
-                    start + wp.static(PART_ROWS) * k,
-                    place,
-                    turn,
-                    part.weight * part.arm,
-                    part.weight,
-                )
+                put_part(rows_out, c, start + wp.static(PART_ROWS) * k, part, place, turn, lever)
         put(rows_out, pack, lane, start + wp.static(PUSH), h * (law.way - law.z))
         put(rows_out, pack, lane, start + wp.static(BOUNCE), -law.before * t.n)
         put(rows_out, pack, lane, start + wp.static(INSET), inset)

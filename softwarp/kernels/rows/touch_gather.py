@@ -16,6 +16,7 @@ from softwarp.kernels.rows.touch_adjoint import (
     ARM,
     BOUNCE,
     INSET,
+    LEVER,
     PART_ROWS,
     PARTS,
     PLACE,
@@ -61,6 +62,24 @@ def kernels(variant: Variant) -> SimpleNamespace:
             pose_bar[world, 7 * frame + 3 + c] = pose_bar[world, 7 * frame + 3 + c] + by_q[c]
 
     @wp.func
+    def add_lever(
+        motion: Motion,
+        pack: int,
+        lane: int,
+        world: int,
+        node: int,
+        frame: int,
+        bar: vec3,
+        rest_pose: wp.array2d(dtype=real),
+        rest_bar: wp.array2d(dtype=real),
+    ):
+        """Add to the gradient by the rest position of a node what it has by where a frame carries it."""
+        if node < rest_bar.shape[1] / 3:
+            q = quat(rest_pose[frame, 3], rest_pose[frame, 4], rest_pose[frame, 5], rest_pose[frame, 6])
+            now = quat_at(motion.pose, pack, lane, 7 * frame + 3)
+            add_world(rest_bar, world, 3 * node, wp.quat_rotate(q, wp.quat_rotate_inv(now, bar)))
+
+    @wp.func
     def add_face(
         scene: Scene,
         motion: Motion,
@@ -70,8 +89,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         world: int,
         face: int,
         by_n: vec3,
+        rest_pose: wp.array2d(dtype=real),
         x_bar: wp.array2d(dtype=real),
         pose_bar: wp.array2d(dtype=real),
+        rest_bar: wp.array2d(dtype=real),
     ):
         """Add what the corners of a soft triangle have by its normal."""
         a = point_x(scene, motion, pack, lane, scene.face_corner[face, 0])
@@ -100,6 +121,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 origin = vector_at(motion.pose, pack, lane, 7 * frame)
                 add_world(pose_bar, world, 7 * frame, bar)
                 add_turn(motion, pack, lane, world, frame, wp.cross(x - origin, bar), pose_bar)
+                add_lever(motion, pack, lane, world, node, frame, bar, rest_pose, rest_bar)
 
     @wp.func
     def face_of(scene: Scene, edge: int, k: int):
@@ -143,6 +165,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         return node, frame
 
     @wp.func
+    def carried_of(scene: Scene, couple: int, key: int, mark: int, k: int):
+        """Node of a part of a contact; -1 for a shape, or a part that is none."""
+        node = int(-1)
+        if k < wp.static(SHAPE):
+            point = member(scene, couple, key, mark, k)
+            if point >= 0:
+                if scene.point_kind[point] == wp.static(Carrier.NODE):
+                    node = scene.point_index[point]
+        return node
+
+    @wp.func
     def add_inset(
         scene: Scene,
         motion: Motion,
@@ -153,8 +186,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
         point: int,
         edge: int,
         by_inset: vec3,
+        rest_pose: wp.array2d(dtype=real),
         x_bar: wp.array2d(dtype=real),
         pose_bar: wp.array2d(dtype=real),
+        rest_bar: wp.array2d(dtype=real),
     ):
         """Add what the faces around a soft point or beside an edge (-1 for none) have by its inset."""
         first = scene.fan_start[point]
@@ -176,7 +211,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for k in range(first, last):
                 face = face_of(scene, edge, k)
                 if face >= 0:
-                    add_face(scene, motion, top, pack, lane, world, face, by_n, x_bar, pose_bar)
+                    add_face(scene, motion, top, pack, lane, world, face, by_n, rest_pose, x_bar, pose_bar, rest_bar)
 
     @wp.kernel(module=module, enable_backward=False)
     def gather(
@@ -187,6 +222,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         scene: Scene,
         top: Topology,
         frame_is_kinematic: wp.array(dtype=wp.int32),
+        rest_pose: wp.array2d(dtype=real),
         # Workspace in
         motion: Motion,
         count_in: wp.array3d(dtype=wp.int32),
@@ -205,8 +241,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         pose_bar_out: wp.array2d(dtype=real),
         twist_bar_out: wp.array2d(dtype=real),
         velocity_bar_out: wp.array2d(dtype=real),
+        rest_bar_out: wp.array2d(dtype=real),
     ):
         """Add what the contacts of one world have by S to gradients by nodes, frames and friction, in their order.
+
+        By rest positions of nodes that frames carry, too, if there is room for these.
 
         What they have where the first solution leads to (``at_end``) has none by friction, of which ``way`` has h H p
         and what is added to it.
@@ -236,6 +275,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                         turn = vector_at(rows_in, pack, lane, row + wp.static(TURN))
                         add_world(pose_bar_out, world, 7 * frame, place)
                         add_turn(motion, pack, lane, world, frame, turn, pose_bar_out)
+                        carried = carried_of(scene, couple, key, face_in[pack, contact, lane], k)
+                        if carried >= 0:
+                            lever = vector_at(rows_in, pack, lane, row + wp.static(LEVER))
+                            add_lever(motion, pack, lane, world, carried, frame, lever, rest_pose, rest_bar_out)
                         add_world(twist_bar_out, world, 6 * frame, weight * bounce)
                         add_world(twist_bar_out, world, 6 * frame + 3, wp.cross(arm, bounce))
                         if frame_is_kinematic[frame] != 0:
@@ -247,7 +290,21 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     edge = int(-1)
                     if scene.couple[couple, wp.static(CoupleColumn.EDGES)] != 0:
                         edge = feature_of(scene, couple, key)
-                    add_inset(scene, motion, top, pack, lane, world, point, edge, inset, x_bar_out, pose_bar_out)
+                    add_inset(
+                        scene,
+                        motion,
+                        top,
+                        pack,
+                        lane,
+                        world,
+                        point,
+                        edge,
+                        inset,
+                        rest_pose,
+                        x_bar_out,
+                        pose_bar_out,
+                        rest_bar_out,
+                    )
                 if mode_in[pack, 4 * contact, lane] == real(2.0) and not at_end:
                     slip = mode_in[pack, 4 * contact + 2, lane] * way_in[pack, 3 * contact + 1, lane]
                     slip += mode_in[pack, 4 * contact + 3, lane] * way_in[pack, 3 * contact + 2, lane]

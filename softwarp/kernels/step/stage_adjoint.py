@@ -56,8 +56,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
         point_bar_in: wp.array3d(dtype=real),
         # Workspace out
         start_out: wp.array3d(dtype=real),
+        offset_out: wp.array3d(dtype=real),
     ):
-        """Add what the points that one frame carries have where the stage started, by its place and turn there."""
+        """Add what the points that one frame carries have where the stage started, by its place and turn there.
+
+        To what carried nodes have by where they are in it, too.
+        """
         pack, frame, lane = wp.tid()
         q = quat_at(pose0_in, pack, lane, 7 * frame + 3)
         place = vec3()
@@ -72,6 +76,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 offset = vec3(carried_offset[item, 0], carried_offset[item, 1], carried_offset[item, 2])
                 place += total
                 turn += wp.cross(wp.quat_rotate(q, offset), total)
+                add_to(offset_out, pack, lane, 3 * item, wp.quat_rotate_inv(q, total))
         add_to(start_out, pack, lane, 6 * frame, place)
         add_to(start_out, pack, lane, 6 * frame + 3, turn)
 

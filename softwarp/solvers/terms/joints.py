@@ -87,8 +87,11 @@ class JointTerm(Term):
         self._gyrate(f_scale, 1 if moving else 0)
 
     def load_tangent(self, h: float) -> None:
-        """Restoring stiffness of joint forces, where chambers have theirs."""
-        if not (self.stiffens and self.shard.options.pressure_tangent):
+        """Restoring stiffness of joint forces in Newton iterations, where chambers have theirs.
+
+        A single linearisation would take it for inertia, as nothing but A has it.
+        """
+        if self.is_linearised or not (self.stiffens and self.shard.options.pressure_tangent):
             return
         s, m, w = self.shard, self.model, self.shard.work
         self._measure_load()

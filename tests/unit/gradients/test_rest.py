@@ -14,7 +14,6 @@ from softwarp import meshing
 from softwarp.gradients import Equilibrium, Rollout, States, jvp
 from tests.cases import material
 from tests.gradient_cases import cube
-from tests.unit.gradients import test_every_input
 from tests.unit.gradients.test_equilibrium import beam
 
 MESH = meshing.box((0.1, 0.04, 0.04), (3, 1, 1))
@@ -182,9 +181,9 @@ def test_both_modes_agree(beside: str, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("beside", ["ball", "branch"])
+@pytest.mark.parametrize("beside", ["ball", "branch", "graded"])
 def test_contacts_and_memories(beside: str, newton: bool) -> None:
-    """Beside contact with a ball, and with a Maxwell branch; cables stretch."""
+    """Beside contact with a ball, with a Maxwell branch, and with factors of moduli, which masses are without."""
     leaf = torch.tensor(REST).requires_grad_()
     stepped(beam_beside(beside, newton, REST), START, leaf).backward()
     assert leaf.grad is not None
@@ -198,7 +197,10 @@ def beam_beside(beside: str, newton: bool, rest: np.ndarray, num_worlds: int = 1
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     memory = (0.3, 0.05) if beside == "branch" else (0.0, 0.0)
     mesh, stuff = replace(MESH, nodes=rest), material("large", 1e5, 0.4)
-    body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory)
+    factors = np.random.default_rng(3).uniform(0.7, 1.5, len(mesh.tets)) if beside == "graded" else None
+    body = builder.add_tets(
+        mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory, stiffness=factors
+    )
     builder.fix(body, box=((-1.0, -1.0, -1.0), (0.01, 1.0, 1.0)))
     if beside != "nothing":
         builder.add_cable(body, CABLE_SHARES @ rest, stiffness=200.0, damping=1.0)
@@ -276,27 +278,25 @@ def test_refusals() -> None:
         Equilibrium(sim)(parameters={"rest_x": shape})
     with pytest.raises(ValueError, match="membrane 'membrane0' has no gradient by the rest shape yet"):
         Rollout(cube(covered=True), rest=True)
-    with pytest.raises(ValueError, match="carry nodes beside integrator 'bdf2' yet; leave rest=True out"):
-        Rollout(test_every_input.carried(integrator="bdf2"), rest=True)
-    with pytest.raises(ValueError, match="carry nodes beside Maxwell branches yet"):
-        Rollout(test_every_input.carried(relaxes=True), rest=True)
-    with pytest.raises(ValueError, match="carry nodes beside contact yet"):
-        Rollout(test_every_input.touching("kinematic"), rest=True)
     with pytest.raises(ValueError, match="equilibria with membrane 'membrane0' have no gradient yet"):
         Equilibrium(cube(covered=True))
 
 
-def carried(rest: np.ndarray, base: str, num_worlds: int = 1) -> sw.Simulation:
+def carried(rest: np.ndarray, base: str, num_worlds: int = 1, beside: str = "", **options: Any) -> sw.Simulation:
     """The beam on a base that moves, with a box at its end that a cable pulls at, whose waypoint is the last node.
 
     Args:
         rest: Rest positions, the waypoint's last.
         base: "fixed" nodes, or a "moved" body that carries them.
         num_worlds: Of the model.
+        beside: A "branch", a "joint" at the box, a "ball" under what a moved base carries, or under the one node that
+            the box carries then, "no cable", or nothing.
+        **options: Of the simulation.
     """
     builder = sw.ModelBuilder(gravity=(0.5, 1.0, -9.81))
     mesh, stuff = replace(MESH, nodes=rest[:-1]), material("large", 1e5, 0.4)
-    body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01))
+    memory = (0.3, 0.05) if beside == "branch" else (0.0, 0.0)
+    body = builder.add_tets(mesh, material=stuff, density=1000.0, rayleigh=(0.5, 0.01), relaxation=memory)
     root, tip = (np.flatnonzero(MESH.nodes[:, 0] == x) for x in (0.0, 0.1))
     if base == "moved":
         held = builder.add_rigid(sw.Box((0.02, 0.04, 0.04)), pose=(-0.01, 0.02, 0.02), kinematic=True)
@@ -304,9 +304,20 @@ def carried(rest: np.ndarray, base: str, num_worlds: int = 1) -> sw.Simulation:
     else:
         builder.fix(body, nodes=root)
     box = builder.add_rigid(sw.Box((0.02, 0.06, 0.05)), mass=0.03, pose=(0.11, 0.02, 0.02, 0.0, 0.6, 0.0, 0.8))
-    builder.attach(body, nodes=tip, to=box)
-    builder.add_cable([body, body, box], np.vstack([CABLE_SHARES[:2] @ rest[:-1], rest[-1:]]), stiffness=200.0)
-    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), dt=0.01)
+    if beside == "ball":
+        tip, corner = tip[: int(base == "fixed")], MESH.nodes[tip[0]] + 0.0194 * np.array([0.5, -0.5, -0.7]) / 0.99**0.5
+        place = (0.005, 0.02, -0.0195) if base == "moved" else tuple(corner)
+        builder.add_contact(body, builder.add_rigid(sw.Sphere(0.02), kinematic=True, pose=place), mu=0.4)
+    if tip.size:
+        builder.attach(body, nodes=tip, to=box)
+    if beside == "joint":
+        lower = builder.add_rigid(sw.Box((0.03, 0.03, 0.03)), mass=0.02, pose=(0.14, 0.02, 0.02))
+        builder.add_joint(box, lower, "hinge", axis=(0.0, 1.0, 0.2), control="position", stiffness=0.2)
+    if beside != "no cable":
+        path = np.vstack([CABLE_SHARES[:2] @ rest[:-1], rest[-1:]])
+        builder.add_cable([body, body, box], path, stiffness=200.0, damping=1.0 if beside else 0.0)
+    found = {"gauss_seidel_iterations": 3000, "gauss_seidel_tolerance": 1e-14, **options}
+    sim = sw.Simulation(builder.finalize(num_worlds=num_worlds, precision="float64"), dt=0.01, **found)
     sim.control.cable_displacement[...] = 0.004
     if base == "moved":
         sim.control.body_velocity[:, 0] = torch.tensor([0.1, 0.0, 0.05, 0.3, 0.5, -1.0])
@@ -316,43 +327,81 @@ def carried(rest: np.ndarray, base: str, num_worlds: int = 1) -> sw.Simulation:
 CARRIED = np.vstack([REST, [0.12, 0.01, 0.04]])
 
 
-def tumbled(sim: sw.Simulation, leaf: torch.Tensor | None, seed: int = 4) -> torch.Tensor:
-    """A number for every world after three steps in which the box turns fast."""
-    rng, worlds = np.random.default_rng(seed), len(sim.node_x)
-    start = torch.tensor(CARRIED + 3e-4 * rng.standard_normal(CARRIED.shape))
-    state = {"node_x": start.expand(worlds, *CARRIED.shape)}
-    state["node_v"] = 0.05 * torch.tensor(rng.standard_normal((worlds, *CARRIED.shape)))
-    if not sim.model.has_kinematic:
-        state["body_twist"] = torch.tensor([0.3, -0.2, 0.1, 6.0, -4.0, 5.0]).double().expand(worlds, 1, 6)
+def tumbled(sim: sw.Simulation, leaf: torch.Tensor | None, seed: int = 4, share: float = 1.0) -> torch.Tensor:
+    """A number for every world after three steps in which the box turns fast, or with a share of these velocities."""
+    rng, worlds, nodes = np.random.default_rng(seed), *sim.node_x.shape[:2]
+    start = torch.tensor((CARRIED + 3e-4 * rng.standard_normal(CARRIED.shape))[:nodes])
+    state = {"node_x": start.expand(worlds, *start.shape)}
+    state["node_v"] = share * 0.05 * torch.tensor(rng.standard_normal((worlds, *CARRIED.shape))[:, :nodes])
+    if not sim.model.has_kinematic and sim.model.joints is None:
+        spins = torch.tensor([0.3, -0.2, 0.1, 6.0, -4.0, 5.0]).double()
+        state["body_twist"] = share * spins.expand(worlds, 1, 6)
     rollout = Rollout(sim, rest=leaf is not None)
     states = rollout(state, parameters=None if leaf is None else {"rest_x": leaf}, steps=3)
-    weight = torch.tensor(np.random.default_rng(5).standard_normal(CARRIED.shape))
+    weight = torch.tensor(np.random.default_rng(5).standard_normal(CARRIED.shape)[:nodes])
     found = ((states.node_x + states.node_v) * weight).flatten(2).sum(dim=(0, 2))
     return found + states.body_twist.flatten(2).sum(dim=(0, 2)) + 0.01 * states.cable_tension.sum(dim=(0, 2))
+
+
+def proved(which: str, base: str, share: float = 1.0, **options: Any) -> None:
+    """Compare the gradient by the rest positions of carried nodes and waypoints, or by all, with differences."""
+    nodes = len(CARRIED) - int(options.get("beside") == "no cable")
+    change = 2e-7 * np.random.default_rng(6).standard_normal(CARRIED.shape)
+    if which == "tip":
+        change[CARRIED[:, 0] < 0.09] = 0.0
+    leaf = torch.tensor(CARRIED[:nodes]).requires_grad_()
+    tumbled(carried(CARRIED, base, **options), leaf, share=share).sum().backward()
+    assert leaf.grad is not None
+    derivative = float((leaf.grad * torch.tensor(change[:nodes])).sum())
+    ways = (1.0, -1.0, 2.0, -2.0)
+    values = [float(tumbled(carried(CARRIED + way * change, base, **options), None, share=share)) for way in ways]
+    expected = (8.0 * (values[0] - values[1]) - (values[2] - values[3])) / 12.0
+    assert abs(derivative - expected) <= 1e-6 * abs(expected)
 
 
 @pytest.mark.parametrize("base", ["fixed", pytest.param("moved", marks=SLOW)])
 @pytest.mark.parametrize("which", [pytest.param("tip", marks=SLOW), "all"])
 def test_what_something_carries(base: str, which: str) -> None:
     """Levers, masses that turn and waypoints on bodies follow the rest shape, by carried nodes alone and by all."""
-    change = 2e-7 * np.random.default_rng(6).standard_normal(CARRIED.shape)
-    if which == "tip":
-        change[CARRIED[:, 0] < 0.09] = 0.0
-    leaf = torch.tensor(CARRIED).requires_grad_()
-    tumbled(carried(CARRIED, base), leaf).sum().backward()
-    assert leaf.grad is not None
-    derivative = float((leaf.grad * torch.tensor(change)).sum())
-    values = [float(tumbled(carried(CARRIED + way * change, base), None)) for way in (1.0, -1.0, 2.0, -2.0)]
-    expected = (8.0 * (values[0] - values[1]) - (values[2] - values[3])) / 12.0
-    assert abs(derivative - expected) <= 1e-6 * abs(expected)
+    proved(which, base)
 
 
-def test_worlds_of_what_something_carries_change_no_bit() -> None:
+OTHER_STEPS = [
+    pytest.param("fixed", {"integrator": "bdf2", "beside": "branch"}, id="smooth"),
+    pytest.param("moved", {"integrator": "bdf2"}, marks=SLOW, id="rough"),
+    pytest.param("fixed", {"integrator": "trapezoidal", "beside": "no cable"}, id="trapezoidal"),
+    pytest.param("moved", {"integrator": "trapezoidal", "beside": "no cable"}, marks=SLOW, id="trapezoidal, moved"),
+    pytest.param("fixed", {"beside": "branch"}, marks=SLOW, id="branch"),
+    pytest.param("moved", NEWTON, id="solved"),
+    pytest.param("fixed", {"beside": "branch", "integrator": "bdf2", **NEWTON}, marks=SLOW, id="solved, branch"),
+    pytest.param("fixed", {"beside": "joint", "integrator": "bdf2"}, marks=SLOW, id="joint"),
+    pytest.param("fixed", {"beside": "joint", **NEWTON}, marks=SLOW, id="solved, joint"),
+    pytest.param("moved", {"beside": "ball"}, id="ball"),
+    pytest.param("fixed", {"beside": "ball"}, marks=SLOW, id="ball at the box"),
+    pytest.param("fixed", {"beside": "ball", "integrator": "bdf2"}, marks=SLOW, id="ball, second order"),
+    pytest.param("moved", {"beside": "ball", **NEWTON}, marks=SLOW, id="ball, solved"),
+]
+
+
+@pytest.mark.parametrize(("base", "options"), OTHER_STEPS)
+@pytest.mark.parametrize("which", [pytest.param("tip", marks=SLOW), "all"])
+def test_what_something_carries_in_other_steps(which: str, base: str, options: dict[str, Any]) -> None:
+    """In steps of second order, of several iterations, with memories, beside joints and contact."""
+    is_smooth = options.get("integrator") in ("bdf2", "trapezoidal") and base == "fixed"
+    proved(which, base, 0.1 if is_smooth and options["beside"] in ("branch", "no cable") else 1.0, **options)
+
+
+@pytest.mark.parametrize(
+    ("base", "options"),
+    [("fixed", {}), ("moved", {"beside": "ball", "integrator": "bdf2"}), ("fixed", {"beside": "branch", **NEWTON})],
+    ids=["one solution", "stages", "solved"],
+)
+def test_worlds_of_what_something_carries_change_no_bit(base: str, options: dict[str, Any]) -> None:
     """Three worlds with their own velocities, and the first of them alone."""
     found = []
     for count in (3, 1):
         leaf = torch.tensor(CARRIED).expand(count, *CARRIED.shape).clone().requires_grad_()
-        tumbled(carried(CARRIED, "fixed", count), leaf).sum().backward()
+        tumbled(carried(CARRIED, base, count, **options), leaf).sum().backward()
         assert leaf.grad is not None
         found.append(leaf.grad[0])
     assert torch.equal(*found)

@@ -161,18 +161,11 @@ def _inflated(builder: sw.ModelBuilder) -> None:
     builder.add_cavity(_box(builder), skin.nodes + 0.03, skin.surface(), control="volume")
 
 
-def _inflated_beside_a_hinge(builder: sw.ModelBuilder) -> None:
-    _inflated(builder)
-    link = builder.add_rigid(sw.Box((0.1, 0.03, 0.02)), mass=0.08, pose=(1.05, 0.0, 0.0))
-    builder.add_joint(None, link, "hinge", anchor=(1.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
-
-
 REFUSED: list[tuple[Callable[[sw.ModelBuilder], object], dict[str, Any], str]] = [
     (_pieces, {}, "a rod that contact cuts into pieces has no gradient yet; leave contact_pieces out"),
     (_tubes, {}, "tubes that slide in each other"),
     (_touching_rod, {}, "as that of rods; take a shape, a mesh or a soft body"),
     (_two_boxes, {}, "as that of two rigid bodies, of which only balls have one"),
-    (_inflated_beside_a_hinge, {"pressure_tangent": True}, "the tangent of pressures has no gradient beside joints"),
     (_still, {}, "a scene where nothing moves freely has nothing to differentiate"),
     (_contact, {"contact_passes": 2}, "more than once a step (contact_passes=2, refinement=1) has no gradient yet"),
 ]
