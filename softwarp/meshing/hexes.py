@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softwarp.meshing.tets import MeshError, TetMesh, _check_arrays, bounding_box, box, check_tets
+from softwarp.meshing.tets import MeshError, TetMesh, _check_arrays, _check_members, bounding_box, box, check_tets
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -92,6 +92,7 @@ def check_hexes(nodes: ArrayLike, hexes: ArrayLike, *, name: str = "mesh") -> No
         MeshError: As ``check_tets``, and for hexahedra whose edges make no positive volume at one of the corners.
     """
     x, h = _check_arrays(nodes, hexes, CORNERS, "hexahedron", name)
+    _check_members(x, h, "hexahedron", "hexes", name)
     corner = x[h]
     longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max(axis=1)
     least = np.linalg.det(corner_jacobians(corner)).min(axis=1)

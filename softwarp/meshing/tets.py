@@ -199,30 +199,33 @@ def check_tets(nodes: ArrayLike, tets: ArrayLike, *, name: str = "mesh") -> None
             shared by more than two.
     """
     x, t = _check_arrays(nodes, tets, 4, "tetrahedron", name)
+    _check_members(x, t, "tetrahedron", "tets", name)
+    _check_volumes(x, t, name)
+    boundary(t, name)
 
+
+def _check_members(x: FloatArray, t: NDArray[Any], kind: str, called: str, name: str) -> None:
+    """Nodes that no element has, nodes at one place, and elements that are there twice."""
     unused = np.flatnonzero(np.bincount(t.reshape(-1), minlength=len(x)) == 0)
     if unused.size:
         raise MeshError(
-            f"mesh {name!r}: {unused.size} of {len(x)} nodes belong to no tetrahedron (first: {_first(unused)}) and "
-            f"would move freely; drop them with meshing.compact(nodes, tets)"
+            f"mesh {name!r}: {unused.size} of {len(x)} nodes belong to no {kind} (first: {_first(unused)}) and "
+            f"would move freely; drop them with meshing.compact(nodes, {called})"
         )
     first, second = _coincident_pairs(x)
     if first.size:
         raise MeshError(
             f"mesh {name!r}: {first.size} nodes coincide with another (first: {first[0]} and {second[0]} at "
             f"{x[first[0]].tolist()} m); the parts beside them are not joined. Weld them in the mesher, or with "
-            f"meshing.weld(nodes, tets)"
+            f"meshing.weld(nodes, {called})"
         )
-    rows = np.sort(t, axis=1)
-    _, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    _, index, inverse = np.unique(np.sort(t, axis=1), axis=0, return_index=True, return_inverse=True)
     repeated = np.flatnonzero(index[inverse.reshape(-1)] != np.arange(len(t)))
     if repeated.size:
         raise MeshError(
-            f"mesh {name!r}: {repeated.size} tetrahedra repeat the corners of another (first: {_first(repeated)}); "
+            f"mesh {name!r}: {repeated.size} {kind} rows repeat the corners of another (first: {_first(repeated)}); "
             f"delete the copies"
         )
-    _check_volumes(x, t, name)
-    boundary(t, name)
 
 
 def _check_arrays(

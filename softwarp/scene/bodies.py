@@ -84,7 +84,10 @@ def add_hexes(
     label = scene.new_name(name, f"body{len(scene.bodies)}")
     checks.choice(lumping, f"body {label!r}: lumping", ("volume", "uniform"))
     damping = factors(rayleigh, f"body {label!r}: rayleigh")
-    if not isinstance(nodes, meshing.HexMesh):
+    if isinstance(nodes, meshing.HexMesh):
+        if hexes is not None:
+            raise ValueError(f"body {label!r}: hexes are given twice; a HexMesh has its own, leave hexes out")
+    else:
         if hexes is None:
             raise ValueError(f"body {label!r}: hexes are missing; pass nodes and hexes, or a HexMesh")
         nodes = meshing.HexMesh(nodes, hexes, label)  # type: ignore[arg-type]
@@ -99,7 +102,7 @@ def add_hexes(
     given: dict[str, Any] = {
         "mesh": nodes.linear(),
         "hexes": nodes.hexes,
-        "thin": bool(thin),
+        "thin": checks.flag(thin, f"body {label!r}: thin"),
         "material": material,
         "density": value,
         "lumping": lumping,

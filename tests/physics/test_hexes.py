@@ -50,10 +50,16 @@ def test_pieces_fill_a_shuffled_brick(rng: np.random.Generator) -> None:
     assert len(shuffled.linear().surface()) == 2 * 2 * (3 * 2 + 2 * 2 + 3 * 2)
 
 
-def test_elements_inside_out_are_refused() -> None:
+def test_broken_meshes_are_refused() -> None:
+    """Elements inside out or there twice, and nodes of none."""
     mesh = meshing.brick(SIZE, CELLS)
-    with pytest.raises(meshing.MeshError, match="inside out at a corner"):
-        meshing.HexMesh(mesh.nodes, mesh.hexes[:, [4, 5, 6, 7, 0, 1, 2, 3]])
+    for nodes, elements, told in (
+        (mesh.nodes, mesh.hexes[:, [4, 5, 6, 7, 0, 1, 2, 3]], "12 of 12 hexahedra are flat or inside out at a corner"),
+        (mesh.nodes, mesh.hexes[[*range(12), 3]], "1 hexahedron rows repeat the corners of another .first: 12"),
+        (np.vstack([mesh.nodes, [1.0, 1.0, 1.0]]), mesh.hexes, "belong to no hexahedron .first: 36"),
+    ):
+        with pytest.raises(meshing.MeshError, match=told):
+            meshing.HexMesh(nodes, elements)
 
 
 def test_equal_bricks_share_a_shape() -> None:
@@ -360,6 +366,10 @@ def test_hexes_say_what_they_do_not_know() -> None:
             builder.add_hexes(mesh, material=law, density=1000.0, name="leg")
     with pytest.raises(ValueError, match="hexes are missing"):
         builder.add_hexes(mesh.nodes, material=sw.Corotational(1e5, 0.4), density=1000.0)
+    with pytest.raises(ValueError, match="hexes are given twice"):
+        builder.add_hexes(mesh, mesh.hexes, material=sw.Corotational(1e5, 0.4), density=1000.0)
+    with pytest.raises(ValueError, match="thin must be True or False, got 'yes'"):
+        builder.add_hexes(mesh, material=sw.Corotational(1e5, 0.4), density=1000.0, thin="yes")  # type: ignore[arg-type]
     sim = block(mesh, held=[0, 1, 2])
     with pytest.raises(ValueError, match="hexahedra, those of body 'body0', have no gradient yet"):
         sw.gradients.Rollout(sim)

@@ -115,7 +115,7 @@ def test_quality_of_a_cube_corner():
         (np.vstack([CORNER, [[5.0, 5.0, 5.0]]]), ONE, "1 of 5 nodes belong to no tetrahedron .first: 4.*compact"),
         (CORNER, [[0, 2, 1, 3]], "1 of 1 tetrahedra are inverted.*orient"),
         (CORNER * [1.0, 1.0, 5e-9], ONE, "1 of 1 tetrahedra are flat"),
-        (CORNER, [[0, 1, 2, 3], [1, 2, 0, 3]], "1 tetrahedra repeat the corners of another .first: 1"),
+        (CORNER, [[0, 1, 2, 3], [1, 2, 0, 3]], "1 tetrahedron rows repeat the corners of another .first: 1"),
     ],
 )
 def test_check_refuses(nodes, tets, message):
