@@ -339,7 +339,7 @@ class EmbeddedPoints:
         """Add what is there now to gradients by nodes."""
         s, d = self.shard, self.detector
         for moves, whole, bar in ((False, self._x, x_bar), (True, self._v, v_bar)):
-            inputs = [s.lanes, self.nodes, moves, d.carrier, d.carrier_weight, d.node_dof, whole]
+            inputs = [s.lanes, self.nodes, d.embedded_count, moves, d.carrier, d.carrier_weight, d.node_dof, whole]
             s.each_real(self.k.spread, None, inputs, [bar])
 
     def index_listed(self, listed: npt.NDArray[np.int32]) -> None:

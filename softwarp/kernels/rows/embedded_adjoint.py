@@ -25,6 +25,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     def spread(
         lanes: int,
         nodes: int,
+        points: int,
         moves: bool,
         # Model
         carrier: wp.array2d(dtype=wp.int32),
@@ -44,7 +45,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if world < bar_out.shape[0]:
             for row in range(3 * nodes):
                 bar_out[world, row] = bar_out[world, row] + whole_in[world, row]
-            for point in range(carrier.shape[0]):
+            for point in range(points):
                 for j in range(4):
                     node = carrier[point, j]
                     if node_dof[node] >= 0 or not moves:
