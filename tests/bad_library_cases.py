@@ -19,7 +19,7 @@ CORNERS = {"tets": ("corners",), "triangles": ("corners",)}
 # Public names that no call has: what functions return or raise, and what other calls take in turn.
 RECORDS = {
     *("EDGES", "CavityWall", "CupMesh", "FingerMesh", "PadMesh", "SolidMesh", "VesselTree", "Maze", "RodGeometry"),
-    *("MembraneGeometry", "MeshError", "MeshReport", "Lumen", "TetMesh", "SurfaceMesh", "QuadraticMesh"),
+    *("MembraneGeometry", "MeshError", "MeshReport", "Lumen", "TetMesh", "HexMesh", "SurfaceMesh", "QuadraticMesh"),
     *("Basis", "Deviation", "Motion", "Reduction", "ReductionFileError", "Sampling"),
     *("Fit", "LeftOut", "Worlds", "Differentiable", "Diverged", "Pose", "States"),
     *("Effector", "Followed", "Outcome", "Solution", "Steerable", "SteerableTubes", "TubeSolution"),
@@ -27,6 +27,7 @@ RECORDS = {
 # Likewise: they have tests of their own for what they refuse, need a package, or take what meshes are made of.
 ELSEWHERE = {
     *("union", "difference", "intersection", "as_surface", "check_tets", "check_closed", "elevate", "embed", "orient"),
+    *("brick", "check_hexes", "quad_shares"),
     *("box", "arc", "helix", "straight", "edge_couplings", "face_middles", "face_shares", "mean_edge", "surface_edges"),
     *("membrane_geometry", "orient_surface", "surface_middles", "surface_parts", "surface_rings"),
     *("deviation", "pod", "read_about", "sample_elements", "train", "leave_out", "side_by_side", "jvp"),
@@ -84,6 +85,7 @@ def _generator_calls() -> list[Call]:
         Call("round_trunk", meshing.round_trunk, {"detail": "coarse"}),
         Call("finger", meshing.finger, {"resolution": "coarse", "kind": "plain"}),
         Call("board", meshing.board, {"resolution": "coarse", "skin": 0.001, "rim": True}, {"rim": {"flag"}}),
+        Call("tripod_bricks", meshing.tripod_bricks, {"across": 4, "along": 6}),
         Call("trunk_skin", meshing.trunk_skin, {"corners": 8}),
         Call("quadruped_skin", meshing.quadruped_skin, {"spacing": 0.011}),
         Call("figurine", meshing.figurine, {"width": 0.04, "name": "f"}, {"name": TEXT}),

@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from softwarp import checks
 from softwarp.meshing.hexes import HexMesh
 from softwarp.meshing.prisms import cut_prisms, split_quads
 from softwarp.meshing.resolutions import check_name
@@ -27,6 +28,7 @@ SIDE = 0.5 * WIDTH / math.sqrt(3.0)  # from the axis to where a leg begins
 HELD = SIDE + (REACH - SIDE) * 5.0 / 6.0  # to the line from which the published mesh is held
 
 GRADING = 0.54  # of the lengths of hexahedra along a leg
+MOST_CELLS = 1000
 # Cells across a leg, along it, from the hole to the leg, and through the thickness. Multiples of the coarse mesh's six
 # keep a line of nodes at 47.3 mm, from where the legs of the published mesh are held.
 DETAILS = {"coarse": (4, 6, 1, 1), "medium": (6, 12, 1, 2), "fine": (10, 18, 2, 3)}
@@ -68,7 +70,12 @@ def tripod_bricks(across: int = 4, along: int = 6) -> HexMesh:
     Args:
         across: Cells across a leg.
         along: Cells along it, up to where it is held.
+
+    Raises:
+        ValueError: If a count is not a positive integer.
     """
+    across = checks.count(across, "tripod_bricks: across", high=MOST_CELLS)
+    along = checks.count(along, "tripod_bricks: along", high=MOST_CELLS)
     place = np.linspace(0.0, 1.0, along + 1)
     rows = SIDE + (HELD - SIDE) * place * (1.0 + GRADING * (1.0 - place))
     strip = np.concatenate([_sector(across, 1), _leg(across, np.append(rows, REACH))])

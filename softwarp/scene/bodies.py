@@ -44,9 +44,7 @@ def add_tets(
     damping = factors(rayleigh, f"body {label!r}: rayleigh")
     mesh, quadratic = _as_mesh(nodes, tets, element, label)
     _doubt_unit(mesh.bounds, label)
-    if not isinstance(material, Material) or not material.law:
-        told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
-        raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
+    _check_law(material, label)
     value = _density(density, total_mass, material, (quadratic or mesh).volume, label)
     if quadratic is not None and lumping != "volume":
         raise ValueError(f"body {label!r}: lumping must be 'volume' for element 'p2', got {lumping!r}")
@@ -92,6 +90,7 @@ def add_hexes(
             raise ValueError(f"body {label!r}: hexes are missing; pass nodes and hexes, or a HexMesh")
         nodes = meshing.HexMesh(nodes, hexes, label)  # type: ignore[arg-type]
     _doubt_unit(nodes.bounds, label)
+    _check_law(material, label)
     if not isinstance(material, Corotational) or material.method != "warped":
         told = f"{type(material).__name__}({material.method!r})" if isinstance(material, Corotational) else material
         raise ValueError(
@@ -110,6 +109,12 @@ def add_hexes(
     if stiffness is not None:
         given["stiffness"] = _stiffness(stiffness, len(nodes.hexes), label)
     return _append(scene, label, contact_surface, rayleigh=damping, relaxation=(0.0, 0.0), **given)
+
+
+def _check_law(material: Any, label: str) -> None:
+    if not isinstance(material, Material) or not material.law:
+        told = f"Corotational, NeoHookean, Yeoh or Material.silicone(name), got {type(material).__name__}"
+        raise TypeError(f"body {label!r}: material must be a material with a law, such as {told}")
 
 
 def _append(scene: Scene, label: str, contact_surface: Any, *, mesh: meshing.TetMesh, **given: Any) -> SoftBody:
