@@ -245,7 +245,9 @@ _SEED = """
 const int lanes = seed.shape[2], last_world = x_bar.shape[0] - 1;
 for (int l = 0; l < lanes; ++l) {
     const int world = lanes * pack + l < last_world ? lanes * pack + l : last_world;
-    const REAL *x = &wp::index(x_bar, world, 0), *v = &wp::index(v_bar, world, 0);
+    const bool has_nodes = x_bar.shape[1] > 0;
+    const REAL *x = has_nodes ? &wp::index(x_bar, world, 0) : nullptr;
+    const REAL *v = has_nodes ? &wp::index(v_bar, world, 0) : nullptr;
     REAL *a = &wp::index(seed, pack, 0, 0) + l, *b = &wp::index(y, pack, 0, 0) + l;
     for (int dof = first; dof < last; ++dof) {
         const int row = 3 * dof_node.data[dof];
