@@ -48,8 +48,9 @@ class ImplicitEuler:
         self.predict = predict
         self.tolerance = system.options.newton_tolerance
         self.iterations = system.options.newton_iterations if iterations is None else iterations
-        self.control = (control or NewtonControl(system)) if self.iterations > 1 else None
+        self.control = (control or NewtonControl(system, steadies=True)) if self.iterations > 1 else None
         self.judged = judged
+        self.keeps = control is None  # contacts of earlier iterates, where worlds are stuck
         self.swings, self.brief = swings, brief
         self.tells = tells and self.control is not None
 
@@ -112,7 +113,7 @@ class ImplicitEuler:
             system.move(h)
             system.measure_rows()
             system.row_laws()
-        system.find_contacts(h, moving=moving, look=self.pace.look)
+        system.find_contacts(h, moving=moving, look=self.pace.look, keeps=self.keeps and iteration > 0)
         control.hold_still()
         system.forces()
         system.tangent()

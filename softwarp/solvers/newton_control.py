@@ -27,13 +27,16 @@ class NewtonControl:
             iterations of others change nothing there; their contacts are not worked on.
         deepest: How deep [m] contacts of each pair may lie at no cost to an iterate's merit, unless the start lies
             deeper, (pair,); contacts with compliance, and with None all, may lie anywhere.
+        steadies: Whether worlds that get stuck keep contacts of earlier iterates from then on.
 
     Attributes:
         left: 1 while worlds have not converged; of ``look_for_others``.
         spare: Not 0 in worlds that nobody asks for, which need not converge, where there are any; int, 1 row.
     """
 
-    def __init__(self, system: System, *, still: bool = False, deepest: ArrayLike | None = None) -> None:
+    def __init__(
+        self, system: System, *, still: bool = False, deepest: ArrayLike | None = None, steadies: bool = False
+    ) -> None:
         self.system, self.shard = system, system.shard
         self.kernels = newton.kernels(system.variant)
         self.rounding = ROUNDING_FLOAT64 if system.model.precision == "float64" else ROUNDING_FLOAT32
@@ -42,6 +45,7 @@ class NewtonControl:
         self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
         real = system.variant.real
         self.deepest = None if deepest is None else wp.array(deepest, dtype=real, device=self.shard.device)
+        self.detector = system.contact.detector if steadies and system.contact is not None else None
         self.left = memory.zeros((1,), wp.int32, self.shard.device)
         still_rows = (*system.multipliers.contact_forces, system.work.residual) if still else ()
         self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
@@ -57,6 +61,13 @@ class NewtonControl:
             self.idle.zero()
         self.shard.each_real(self.kernels.begin, None, [], [self.system.work.control.real])
         self.multiplier.copy_from(self.system.work.multiplier)
+        self._look_for_stuck()
+
+    def _look_for_stuck(self) -> None:
+        if self.detector is not None:
+            self.detector.any_stuck.zero_()
+            outputs = [self.detector.stuck.real, self.detector.any_stuck]
+            self.shard.each_real(self.kernels.look_for_stuck, None, [self.system.work.control.real], outputs)
 
     def judge(self, *, first: bool, tolerance: float, f_scale: float) -> None:
         """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``.
@@ -74,10 +85,12 @@ class NewtonControl:
             inputs += [contact.pairs.distance.real, contact.detector.touch.real]
             s.each_real(self.kernels.measure_depth, None, inputs, [w.control.real])
         inputs = [first, tolerance, self.rounding, self.rounding_force * f_scale]
-        inputs += [m.segment_count == 0, self.system.rows.count]
+        stuck_limit = newton.STUCK_LIMIT if self.detector is not None else float("inf")
+        inputs += [m.segment_count == 0, stuck_limit, self.system.rows.count]
         inputs += [m.row_size, w.norm.real, w.gap.real]
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
         s.each_real(self.kernels.judge, None, inputs, [w.control.real])
+        self._look_for_stuck()
 
     def keep(self, *, last: bool) -> None:
         """Store accepted and best iterates; after the ``last`` one, worlds that have not converged get their best."""

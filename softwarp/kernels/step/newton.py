@@ -12,12 +12,14 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 # Rows of the per-world control array
 MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, WITHIN = range(11)
-DEPTH, DEPTH_FIRST, ROWS = range(11, 14)  # of the present iterate and the first one
+DEPTH, DEPTH_FIRST = range(11, 13)  # of the present iterate and the first one
+STUCK, ROWS = range(13, 15)
 PROGRESS = 0.8  # of the best merit: what counts as an improvement
 PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
 REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A after a solve that failed or did not
 LEAST_SHARE = 0.1  # below it the tangent is left out for the rest of the step
 DEPTH_MERIT = 0.1  # what each unit of an iterate's depth beyond the first one adds to its merit
+STUCK_LIMIT = 4.0  # iterations without progress after which contacts of earlier iterates stay
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -47,6 +49,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(WITHIN), lane] = real(0.0)
         control_out[pack, wp.static(DEPTH), lane] = real(0.0)
         control_out[pack, wp.static(DEPTH_FIRST), lane] = real(0.0)
+        control_out[pack, wp.static(STUCK), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def measure_depth(
@@ -80,6 +83,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         rounding: real,
         rounding_force: real,
         monotone: bool,
+        stuck_limit: real,
         row_count: int,
         # Model
         row_size: wp.array(dtype=real),
@@ -103,6 +107,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
         search is not ``monotone`` patience never ends.
         A world whose last solve failed has not converged: it stands where it did, and forces balance at a saddle too.
+        After ``stuck_limit`` iterations without progress a world is told to be stuck, once, and has as much patience again.
         Imbalance knows nothing of a wall that contacts of the iterate before have not held back from. So a depth beyond
         1, and beyond that of the start, adds to the merit by which an iterate is best or has converged.
         """
@@ -145,6 +150,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     control_out[pack, wp.static(BEST), lane] = merit + deep
                     stall = real(0.0)
                     improved = True
+                if stall >= stuck_limit and not is_rounding and control_out[pack, wp.static(STUCK), lane] < real(0.5):
+                    control_out[pack, wp.static(STUCK), lane] = real(1.0)
+                    stall = real(0.0)
                 control_out[pack, wp.static(STALL), lane] = stall
                 is_still = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
                 if was_solved and (merit + deep <= tolerance or (is_still and deep <= tolerance)):
@@ -297,6 +305,22 @@ def kernels(variant: Variant) -> SimpleNamespace:
             multiplier_out[pack, row, lane] = reference_out[pack, row, lane]
 
     @wp.kernel(module=module, enable_backward=False)
+    def look_for_stuck(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        stuck_out: wp.array3d(dtype=wp.int32),
+        any_out: wp.array(dtype=wp.int32),
+    ):
+        """Whether a world is stuck, and whether any is."""
+        pack, lane = wp.tid()
+        stuck = int(0)
+        if control_in[pack, wp.static(STUCK), lane] > real(0.5):
+            stuck = int(1)
+            wp.atomic_max(any_out, 0, 1)  # few worlds
+        stuck_out[pack, 0, lane] = stuck
+
+    @wp.kernel(module=module, enable_backward=False)
     def look_for_others(
         # Workspace in
         control_in: wp.array3d(dtype=real),
@@ -327,6 +351,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             value_out[pack, row, lane] = held_in[pack, row, lane]
 
     return SimpleNamespace(
+        look_for_stuck=look_for_stuck,
         look_for_others=look_for_others,
         hold_still=hold_still,
         begin=begin,
