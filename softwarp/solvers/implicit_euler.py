@@ -7,6 +7,7 @@ from functools import partial
 
 import warp as wp
 
+from softwarp.kernels.step.newton import STUCK_LIMIT
 from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
@@ -50,7 +51,7 @@ class ImplicitEuler:
         self.iterations = system.options.newton_iterations if iterations is None else iterations
         self.control = (control or NewtonControl(system, steadies=True)) if self.iterations > 1 else None
         self.judged = judged
-        self.keeps = control is None  # contacts of earlier iterates, where worlds are stuck
+        self.is_further = False
         self.swings, self.brief = swings, brief
         self.tells = tells and self.control is not None
 
@@ -104,6 +105,24 @@ class ImplicitEuler:
                 wp.capture_if(control.left, partial(self._improve, control, iteration))
             else:
                 self._improve(control, iteration)
+        if control.detector is not None and self.iterations > STUCK_LIMIT:
+            self._go_further(control)
+
+    def _go_further(self, control: NewtonControl) -> None:
+        """Worlds that got stuck take as many iterations again, in which contacts of earlier ones stay."""
+        control.begin_further()
+        self.is_further = True
+        if self.always:
+            for _ in range(self.iterations):
+                self._further(control)
+        else:
+            wp.capture_while(control.left, partial(self._further, control))
+        self.is_further = False
+        control.end_further()
+
+    def _further(self, control: NewtonControl) -> None:
+        self._improve(control, 0)
+        control.count_further(self.iterations)
 
     def _evaluate(self, control: NewtonControl, iteration: int) -> None:
         """Forces, tangent and merit of an iterate."""
@@ -113,7 +132,7 @@ class ImplicitEuler:
             system.move(h)
             system.measure_rows()
             system.row_laws()
-        system.find_contacts(h, moving=moving, look=self.pace.look, keeps=self.keeps and iteration > 0)
+        system.find_contacts(h, moving=moving, look=self.pace.look, keeps=self.is_further)
         control.hold_still()
         system.forces()
         system.tangent()

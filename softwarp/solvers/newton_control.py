@@ -27,7 +27,7 @@ class NewtonControl:
             iterations of others change nothing there; their contacts are not worked on.
         deepest: How deep [m] contacts of each pair may lie at no cost to an iterate's merit, unless the start lies
             deeper, (pair,); contacts with compliance, and with None all, may lie anywhere.
-        steadies: Whether worlds that get stuck keep contacts of earlier iterates from then on.
+        steadies: Whether worlds that got stuck take further iterations, in which contacts of earlier ones stay.
 
     Attributes:
         left: 1 while worlds have not converged; of ``look_for_others``.
@@ -45,9 +45,11 @@ class NewtonControl:
         self.reference, self.best, self.direction = (allocate(dofs) for _ in range(3))
         real = system.variant.real
         self.deepest = None if deepest is None else wp.array(deepest, dtype=real, device=self.shard.device)
-        self.detector = system.contact.detector if steadies and system.contact is not None else None
         self.left = memory.zeros((1,), wp.int32, self.shard.device)
-        still_rows = (*system.multipliers.contact_forces, system.work.residual) if still else ()
+        self.detector = system.contact.detector if steadies and system.contact is not None else None
+        self.holds = still  # whether worlds that stay as they are are given back what they had
+        held_rows = still or self.detector is not None
+        still_rows = (*system.multipliers.contact_forces, system.work.residual) if held_rows else ()
         self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
         worlds = (self.shard.variant, self.shard.world_count, 1, self.shard.device, wp.int32)
         self.spare = rows.allocate(*worlds)
@@ -57,17 +59,31 @@ class NewtonControl:
 
     def begin(self) -> None:
         """Reset the control rows of all worlds, whose contacts all are worked on."""
-        if self.still:
+        if self.holds:
             self.idle.zero()
         self.shard.each_real(self.kernels.begin, None, [], [self.system.work.control.real])
         self.multiplier.copy_from(self.system.work.multiplier)
-        self._look_for_stuck()
-
-    def _look_for_stuck(self) -> None:
         if self.detector is not None:
-            self.detector.any_stuck.zero_()
-            outputs = [self.detector.stuck.real, self.detector.any_stuck]
-            self.shard.each_real(self.kernels.look_for_stuck, None, [self.system.work.control.real], outputs)
+            self.detector.stuck.zero()
+
+    def begin_further(self) -> None:
+        """Worlds that have been stuck, and have not converged, go on; all others halt and keep what they have."""
+        assert self.detector is not None
+        self.holds = True
+        outputs = [self.system.work.control.real, self.detector.stuck.real]
+        self.shard.each_real(self.kernels.begin_further, None, [], outputs)
+        self.look_for_others()
+
+    def count_further(self, most: int) -> None:
+        """Worlds that have converged, or gone on ``most`` times, halt."""
+        self.shard.each_real(self.kernels.count_further, None, [most], [self.system.work.control.real])
+        self.look_for_others()
+
+    def end_further(self) -> None:
+        """All worlds count again; those that have not converged get their best iterate."""
+        self.holds = False
+        self.idle.zero()
+        self.keep(last=True)
 
     def judge(self, *, first: bool, tolerance: float, f_scale: float) -> None:
         """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``.
@@ -85,12 +101,10 @@ class NewtonControl:
             inputs += [contact.pairs.distance.real, contact.detector.touch.real]
             s.each_real(self.kernels.measure_depth, None, inputs, [w.control.real])
         inputs = [first, tolerance, self.rounding, self.rounding_force * f_scale]
-        stuck_limit = newton.STUCK_LIMIT if self.detector is not None else float("inf")
-        inputs += [m.segment_count == 0, stuck_limit, self.system.rows.count]
+        inputs += [m.segment_count == 0, self.system.rows.count]
         inputs += [m.row_size, w.norm.real, w.gap.real]
         inputs += [w.multiplier.real, w.lower_bound.real, w.upper_bound.real]
         s.each_real(self.kernels.judge, None, inputs, [w.control.real])
-        self._look_for_stuck()
 
     def keep(self, *, last: bool) -> None:
         """Store accepted and best iterates; after the ``last`` one, worlds that have not converged get their best."""
@@ -110,7 +124,7 @@ class NewtonControl:
 
     def hold_still(self) -> None:
         """Give converged worlds back what they had: others' iterations, and to carry forces to new axes, change it."""
-        for values, held in self.still:
+        for values, held in self.still if self.holds else ():
             inputs = [self.system.work.control.real, held.real]
             self.shard.each_real(self.kernels.hold_still, values.real.shape[1], inputs, [values.real])
 

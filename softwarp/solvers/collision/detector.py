@@ -220,7 +220,6 @@ class Detector:
         kept = self.capacity if self.k_keep is not None else 0
         self.held, self.known_held, self.known_couple, self.known_face = (integer(kept) for _ in range(4))
         self.stuck = integer(1)
-        self.any_stuck = memory.zeros((1,), wp.int32, self.device)
         self.touch = real(TOUCH_ROWS * self.capacity)
         self.seats = 0 if self.variant.world_fastest else SEATS * self.capacity
         self.found_key, self.found_touch = integer(self.seats), real(TOUCH_ROWS * self.seats)
