@@ -109,7 +109,7 @@ class ImplicitEuler:
             self._go_further(control)
 
     def _go_further(self, control: NewtonControl) -> None:
-        """Worlds that got stuck take as many iterations again, in which contacts of earlier ones stay."""
+        """Worlds that got stuck may take as many iterations again, in which contacts of earlier ones stay."""
         control.begin_further()
         self.is_further = True
         if self.always:
@@ -121,6 +121,7 @@ class ImplicitEuler:
         control.end_further()
 
     def _further(self, control: NewtonControl) -> None:
+        """One of these iterations."""
         self._improve(control, 0)
         control.count_further(self.iterations)
 

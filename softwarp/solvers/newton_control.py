@@ -67,11 +67,11 @@ class NewtonControl:
             self.detector.stuck.zero()
 
     def begin_further(self) -> None:
-        """Worlds that have been stuck, and have not converged, go on; all others halt and keep what they have."""
+        """Worlds with contacts that got stuck, and have not converged, go on; others halt and keep what they have."""
         assert self.detector is not None
         self.holds = True
         outputs = [self.system.work.control.real, self.detector.stuck.real]
-        self.shard.each_real(self.kernels.begin_further, None, [], outputs)
+        self.shard.each_real(self.kernels.begin_further, None, [self.detector.contacts.count.real], outputs)
         self.look_for_others()
 
     def count_further(self, most: int) -> None:

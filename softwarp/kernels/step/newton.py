@@ -13,7 +13,7 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 # Rows of the per-world control array
 MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, WITHIN = range(11)
 DEPTH, DEPTH_FIRST = range(11, 13)  # of the present iterate and the first one
-STUCK, HALTED, MORE, ROWS = range(13, 17)  # has been stuck; takes none of the further iterations; how many it took
+STUCK, HALTED, MORE, ROWS = range(13, 17)  # has been stuck; takes no further iterations; how many it took
 PROGRESS = 0.8  # of the best merit: what counts as an improvement
 PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
 REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A after a solve that failed or did not
@@ -311,13 +311,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def begin_further(
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
         # Workspace out
         control_out: wp.array3d(dtype=real),
         stuck_out: wp.array3d(dtype=wp.int32),
     ):
-        """A world that has been stuck, and has not converged, has patience again; all others halt."""
+        """A world with contacts that has been stuck, and has not converged, has patience again; all others halt."""
         pack, lane = wp.tid()
         stuck = control_out[pack, wp.static(STUCK), lane] - control_out[pack, wp.static(FROZEN), lane] > real(0.5)
+        stuck = stuck and count_in[pack, 0, lane] > 0
         stuck_out[pack, 0, lane] = wp.where(stuck, 1, 0)
         control_out[pack, wp.static(HALTED), lane] = wp.where(stuck, real(0.0), real(1.0))
         control_out[pack, wp.static(MORE), lane] = real(0.0)

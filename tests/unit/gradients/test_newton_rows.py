@@ -299,8 +299,11 @@ def test_contacts_that_came_and_went(scene: str, seed: int) -> None:
     """
     sizes = larger(test_touches.SIZES, 1.0)
     sim, given = come_and_go(scene, (seed,))
+    found = test_touches.modes(sim, given)
+    assert found & {STUCK, SLIPPING}
+    if SLIPPING not in found:
+        del given["parameters"]["pair_mu"]  # what sticks does not depend on it, and differences are rounding
     check(Rollout(sim), given, test_touches.loss, sizes)
-    assert test_touches.modes(sim, given) & {STUCK, SLIPPING}
 
 
 def come_and_go(scene: str, seeds: tuple[int, ...], precision: str = "float64") -> tuple[sw.Simulation, Inputs]:
