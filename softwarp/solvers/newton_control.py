@@ -13,6 +13,7 @@ from softwarp.model.model import Model
 from softwarp.scene.materials import lame
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
 
 ROUNDING_FLOAT32 = 1e-3  # relative imbalance that coordinates of this precision can cause in stiff, thin bodies
 ROUNDING_FLOAT64 = 1e-10
@@ -56,6 +57,12 @@ class NewtonControl:
         self.idle = rows.allocate(*worlds) if system.contact is None else system.contact.contacts.idle
         count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
+        self.returns = rows.allocate(*worlds)
+        self.before: list[tuple[Rows, Rows]] = []
+        if self.detector is not None:
+            w, forces = system.work, (*system.multipliers.contact_forces, system.work.residual)
+            changed = (w.control, w.dof_v, w.multiplier, self.best, self.best_multiplier, *forces)
+            self.before = [(values, allocate(values.real.shape[1])) for values in changed]
 
     def begin(self) -> None:
         """Reset the control rows of all worlds, whose contacts all are worked on."""
@@ -69,6 +76,8 @@ class NewtonControl:
     def begin_further(self) -> None:
         """Worlds with contacts that got stuck, and have not converged, go on; others halt and keep what they have."""
         assert self.detector is not None
+        for values, before in self.before:
+            before.copy_from(values)
         self.holds = True
         outputs = [self.system.work.control.real, self.detector.stuck.real]
         self.shard.each_real(self.kernels.begin_further, None, [self.detector.contacts.count.real], outputs)
@@ -78,6 +87,19 @@ class NewtonControl:
         """Worlds that have converged, or gone on ``most`` times, halt."""
         self.shard.each_real(self.kernels.count_further, None, [most], [self.system.work.control.real])
         self.look_for_others()
+
+    def give_up(self) -> None:
+        """Worlds that have not converged go back to where they were before, with the contacts of there."""
+        assert self.detector is not None
+        inputs, outputs = [self.system.work.control.real], [self.detector.stuck.real, self.returns.real]
+        self.shard.each_real(self.kernels.end_further, None, inputs, outputs)
+        self.give_back()
+
+    def give_back(self) -> None:
+        """What worlds had that go back; once more after their contacts have been found again."""
+        for values, before in self.before:
+            inputs = [self.returns.real, before.real]
+            self.shard.each_real(self.kernels.give_back, values.real.shape[1], inputs, [values.real])
 
     def end_further(self) -> None:
         """All worlds count again; those that have not converged get their best iterate."""

@@ -20,6 +20,7 @@ REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A af
 LEAST_SHARE = 0.1  # below it the tangent is left out for the rest of the step
 DEPTH_MERIT = 0.1  # what each unit of an iterate's depth beyond the first one adds to its merit
 STUCK_LIMIT = 4  # iterations without progress after which a world may take further ones
+USUAL = 12  # iterations that usually suffice: with fewer at hand, none takes further ones
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -328,6 +329,34 @@ def kernels(variant: Variant) -> SimpleNamespace:
             control_out[pack, wp.static(STALL), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
+    def end_further(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        stuck_out: wp.array3d(dtype=wp.int32),
+        returns_out: wp.array3d(dtype=wp.int32),
+    ):
+        """A stuck world that has not converged goes back to where it was before, and keeps no contacts."""
+        pack, lane = wp.tid()
+        returns = stuck_out[pack, 0, lane] != 0 and control_in[pack, wp.static(FROZEN), lane] < real(0.5)
+        returns_out[pack, 0, lane] = wp.where(returns, 1, 0)
+        if returns:
+            stuck_out[pack, 0, lane] = 0
+
+    @wp.kernel(module=module, enable_backward=False)
+    def give_back(
+        # Workspace in
+        returns_in: wp.array3d(dtype=wp.int32),
+        before_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+    ):
+        """What a world that goes back had before."""
+        pack, row, lane = wp.tid()
+        if returns_in[pack, 0, lane] != 0:
+            value_out[pack, row, lane] = before_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
     def count_further(
         most: int,
         # Workspace out
@@ -374,6 +403,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     return SimpleNamespace(
         begin_further=begin_further,
         count_further=count_further,
+        end_further=end_further,
+        give_back=give_back,
         look_for_others=look_for_others,
         hold_still=hold_still,
         begin=begin,
