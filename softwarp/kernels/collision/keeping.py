@@ -1,4 +1,4 @@
-"""Contacts that pressed in an earlier iterate of a step stay in its list. Theory: docs/theory/newton.md, Contacts.
+"""Contacts that pressed in an earlier iterate stay listed in stuck worlds. Theory: docs/theory/newton.md, Contacts.
 
 Detection takes the nearest part of a target, and the lowest place of an edge: between two iterates, these may jump from
 one part to another and back, each of which holds what the other lets through. What is kept is measured where the
