@@ -7,6 +7,7 @@ from functools import partial
 
 import warp as wp
 
+from softwarp.kernels.step.newton import USUAL
 from softwarp.solvers.newton_control import NewtonControl
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.term import Pace
@@ -48,8 +49,10 @@ class ImplicitEuler:
         self.predict = predict
         self.tolerance = system.options.newton_tolerance
         self.iterations = system.options.newton_iterations if iterations is None else iterations
-        self.control = (control or NewtonControl(system)) if self.iterations > 1 else None
+        self.control = (control or NewtonControl(system, steadies=True)) if self.iterations > 1 else None
         self.judged = judged
+        steadies = self.control is not None and self.control.detector is not None
+        self.goes_further, self.is_further = steadies and self.iterations >= USUAL, False
         self.swings, self.brief = swings, brief
         self.tells = tells and self.control is not None
 
@@ -109,6 +112,41 @@ class ImplicitEuler:
                 wp.capture_if(control.left, end)
             else:
                 end()
+        if self.goes_further:
+            self._go_further(control)
+
+    def _go_further(self, control: NewtonControl) -> None:
+        """Worlds that got stuck may take as many iterations again, in which contacts of earlier ones stay."""
+        control.begin_further()
+        self.is_further = True
+        if self.always:
+            self._take_further(control)
+        else:
+            wp.capture_if(control.left, partial(self._take_further, control))
+        self.is_further = False
+        control.end_further()
+
+    def _take_further(self, control: NewtonControl) -> None:
+        """They take them; those that have not converged even so go back to where they were."""
+        system = self.system
+        if self.always:
+            for _ in range(self.iterations):
+                self._further(control)
+        else:
+            wp.capture_while(control.left, partial(self._further, control))
+        control.give_up()
+        system.move(self.h)
+        system.measure_rows()
+        system.row_laws()
+        system.find_contacts(self.h, moving=True, look=self.pace.look, keeps=True)
+        control.hold_still()
+        control.give_back()
+        system.forces()
+
+    def _further(self, control: NewtonControl) -> None:
+        """One of these iterations."""
+        self._improve(control, 0)
+        control.count_further(self.iterations)
 
     def _evaluate(self, control: NewtonControl, iteration: int) -> None:
         """Forces, tangent and merit of an iterate."""
@@ -118,14 +156,14 @@ class ImplicitEuler:
             system.move(h)
             system.measure_rows()
             system.row_laws()
-        system.find_contacts(h, moving=moving, look=self.pace.look)
+        system.find_contacts(h, moving=moving, look=self.pace.look, keeps=self.is_further)
         control.hold_still()
         system.forces()
         system.tangent()
         system.right_hand_side(h, inertia=True, moving=moving)
         system.imbalance(h, inertia=True)
         control.judge(first=iteration == 0, tolerance=self.tolerance, f_scale=h)
-        control.keep(last=iteration == self.iterations)
+        control.keep(last=iteration == self.iterations and not self.goes_further)
         if self.brief:
             control.look_for_others()
 

@@ -45,6 +45,7 @@ class NewtonAdjoint(StageAdjoint):
     """
 
     follows = 0.0
+    keeps = True
     touches = EndContacts
 
     def __init__(

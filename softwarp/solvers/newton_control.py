@@ -13,6 +13,7 @@ from softwarp.model.model import Model
 from softwarp.scene.materials import lame
 from softwarp.solvers.system import System
 from softwarp.solvers.workspace import rows
+from softwarp.solvers.workspace.rows import Rows
 
 ROUNDING_FLOAT32 = 1e-3  # relative imbalance that coordinates of this precision can cause in stiff, thin bodies
 ROUNDING_FLOAT64 = 1e-10
@@ -28,13 +29,16 @@ class NewtonControl:
             get the contacts and forces of their best iterate, if ``find_best_contacts`` ends their iterations.
         deepest: How deep [m] contacts of each pair may lie at no cost to an iterate's merit, unless the start lies
             deeper, (pair,); contacts with compliance, and with None all, may lie anywhere.
+        steadies: Whether worlds that got stuck take further iterations, in which contacts of earlier ones stay.
 
     Attributes:
         left: 1 while worlds have not converged; of ``look_for_others``.
         spare: Not 0 in worlds that nobody asks for, which need not converge, where there are any; int, 1 row.
     """
 
-    def __init__(self, system: System, *, still: bool = False, deepest: ArrayLike | None = None) -> None:
+    def __init__(
+        self, system: System, *, still: bool = False, deepest: ArrayLike | None = None, steadies: bool = False
+    ) -> None:
         self.system, self.shard = system, system.shard
         self.kernels = newton.kernels(system.variant)
         self.rounding = ROUNDING_FLOAT64 if system.model.precision == "float64" else ROUNDING_FLOAT32
@@ -44,7 +48,10 @@ class NewtonControl:
         real = system.variant.real
         self.deepest = None if deepest is None else wp.array(deepest, dtype=real, device=self.shard.device)
         self.left = memory.zeros((1,), wp.int32, self.shard.device)
-        still_rows = (*system.multipliers.contact_forces, system.work.residual) if still else ()
+        self.detector = system.contact.detector if steadies and system.contact is not None else None
+        self.holds = still  # whether worlds that stay as they are are given back what they had
+        held_rows = still or self.detector is not None
+        still_rows = (*system.multipliers.contact_forces, system.work.residual) if held_rows else ()
         self.still = [(values, allocate(values.real.shape[1])) for values in still_rows]
         worlds = (self.shard.variant, self.shard.world_count, 1, self.shard.device, wp.int32)
         self.spare = rows.allocate(*worlds)
@@ -58,13 +65,55 @@ class NewtonControl:
         self.idle = rows.allocate(*worlds) if system.contact is None else system.contact.contacts.idle
         count = max(system.rows.count, 1)
         self.multiplier, self.best_multiplier = allocate(count), allocate(count)
+        self.returns = rows.allocate(*worlds)
+        self.before: list[tuple[Rows, Rows]] = []
+        if self.detector is not None:
+            w, forces = system.work, (*system.multipliers.contact_forces, system.work.residual)
+            changed = (w.control, w.dof_v, w.multiplier, self.best, self.best_multiplier, *forces)
+            self.before = [(values, allocate(values.real.shape[1])) for values in changed]
 
     def begin(self) -> None:
         """Reset the control rows of all worlds, whose contacts all are worked on."""
-        if self.still:
+        if self.holds:
             self.idle.zero()
         self.shard.each_real(self.kernels.begin, None, [], [self.system.work.control.real])
         self.multiplier.copy_from(self.system.work.multiplier)
+        if self.detector is not None:
+            self.detector.stuck.zero()
+
+    def begin_further(self) -> None:
+        """Worlds with contacts that got stuck, and have not converged, go on; others halt and keep what they have."""
+        assert self.detector is not None
+        for values, before in self.before:
+            before.copy_from(values)
+        self.holds = True
+        outputs = [self.system.work.control.real, self.detector.stuck.real]
+        self.shard.each_real(self.kernels.begin_further, None, [self.detector.contacts.count.real], outputs)
+        self.look_for_others()
+
+    def count_further(self, most: int) -> None:
+        """Worlds that have converged, or gone on ``most`` times, halt."""
+        self.shard.each_real(self.kernels.count_further, None, [most], [self.system.work.control.real])
+        self.look_for_others()
+
+    def give_up(self) -> None:
+        """Worlds that have not converged go back to where they were before, with the contacts of there."""
+        assert self.detector is not None
+        inputs, outputs = [self.system.work.control.real], [self.detector.stuck.real, self.returns.real]
+        self.shard.each_real(self.kernels.end_further, None, inputs, outputs)
+        self.give_back()
+
+    def give_back(self) -> None:
+        """What worlds had that go back; once more after their contacts have been found again."""
+        for values, before in self.before:
+            inputs = [self.returns.real, before.real]
+            self.shard.each_real(self.kernels.give_back, values.real.shape[1], inputs, [values.real])
+
+    def end_further(self) -> None:
+        """All worlds count again; those that have not converged get their best iterate."""
+        self.holds = False
+        self.idle.zero()
+        self.keep(last=True)
 
     def judge(self, *, first: bool, tolerance: float, f_scale: float) -> None:
         """Accept or reject the present iterate; needs ``System.imbalance`` with the same ``f_scale``.
@@ -116,7 +165,7 @@ class NewtonControl:
 
     def hold_still(self) -> None:
         """Give converged worlds back what they had: others' iterations, and to carry forces to new axes, change it."""
-        for values, held in self.still:
+        for values, held in self.still if self.holds else ():
             inputs = [self.system.work.control.real, held.real]
             self.shard.each_real(self.kernels.hold_still, values.real.shape[1], inputs, [values.real])
 

@@ -67,6 +67,7 @@ class StageAdjoint(StepAdjoint):
     predicts = True
     touches: type[ContactAdjoint] = StartContacts
     follows = 1.0
+    keeps = False  # contacts of the iterates that have led here
 
     def __init__(
         self,
@@ -134,7 +135,7 @@ class StageAdjoint(StepAdjoint):
         system.measure_rows()
         system.row_laws()
         if self.contact is not None and not isinstance(self.contact, StartContacts):
-            system.find_contacts(h, moving=True, look=self.look)
+            system.find_contacts(h, moving=True, look=self.look, keeps=self.keeps)
 
     def solve_again(self) -> None:
         """Take the stage as far as its solution, from the system's state; the state stays as it is."""

@@ -186,10 +186,15 @@ class System:
         for term in self.terms:
             term.law()
 
-    def find_contacts(self, h: float, moving: bool, falling: bool = True, look: float | None = None) -> None:
-        """Contacts at the trial positions; ``moving`` says that velocities have been found in this step."""
+    def find_contacts(
+        self, h: float, moving: bool, falling: bool = True, look: float | None = None, *, keeps: bool = False
+    ) -> None:
+        """Contacts at the trial positions; ``moving`` says that velocities have been found in this step.
+
+        With ``keeps`` those that pressed in earlier iterates of the step are among them.
+        """
         for term in self.terms:
-            term.find(h, h if look is None else look, moving=moving, falling=falling)
+            term.find(h, h if look is None else look, moving=moving, falling=falling, keeps=keeps)
 
     def check_velocities(self) -> None:
         """Raise flags for start velocities that are not finite; Newton's step control would hide them."""

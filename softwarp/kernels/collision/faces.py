@@ -15,6 +15,7 @@ from softwarp.model.codes import CORNER, EDGE, FACE, FAR, Target
 
 SHARP = 0.996  # cosine of the angle between faces below which the edge between them can touch (5 degrees)
 CONE = 0.05  # sine by which a normal may leave the cone of an edge
+HELD_CONE = 0.15  # likewise of edges that pressed in an earlier iterate of the step, see ``keeping``
 END = 1.0e-3  # part at the ends of an edge that belongs to its points
 BORDER = 1.0e-6  # distance relative to an edge below which the direction to the nearest point is not used
 
@@ -162,21 +163,23 @@ def functions(scalar: Any) -> SimpleNamespace:
         return gap
 
     @wp.func
-    def is_in_cone(scene: Scene, motion: Motion, pack: int, lane: int, target: int, face: int, side: int, n: vec3):
+    def is_in_cone(
+        scene: Scene, motion: Motion, pack: int, lane: int, target: int, face: int, side: int, n: vec3, cone: real
+    ):
         """Whether n leaves the edge ``side`` of a face outwards, between the normals of the two faces beside it.
 
-        Edges that are nearly flat, or that fold inwards, have no such normals.
+        That is to a sine of ``cone``. Edges that are nearly flat, or that fold inwards, have no such normals.
         """
         a = corner_x(scene, motion, pack, lane, target, scene.face_corner[face, side])
         b = corner_x(scene, motion, pack, lane, target, scene.face_corner[face, (side + 1) % 3])
         e = wp.normalize(b - a)
         n1 = normal_of(scene, motion, pack, lane, target, face)
         other = scene.face_beside[face, side]
-        good = wp.dot(n, wp.cross(n1, e)) <= real(CONE)
+        good = wp.dot(n, wp.cross(n1, e)) <= cone
         if other >= 0:
             n2 = normal_of(scene, motion, pack, lane, target, other)
             good = good and wp.dot(n1, n2) < real(SHARP)
-            good = good and wp.dot(n, wp.cross(e, n2)) <= real(CONE)
+            good = good and wp.dot(n, wp.cross(e, n2)) <= cone
             good = good and wp.dot(n, n1 + n2) > real(0.0)
         return good
 

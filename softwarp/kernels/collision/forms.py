@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from softwarp.kernels.collision import closest, faces, features, geometry, shape_touches, shapes
+from softwarp.kernels.collision import box_edges, closest, faces, features, geometry, shape_touches, shapes
 from softwarp.kernels.collision.closest import INSIDE, SIDE, VERTEX
 from softwarp.kernels.collision.shape_touches import LEVEL, UNSURE
 from softwarp.model.codes import FAR, FLAT, Carrier, CoupleColumn, Target
@@ -274,6 +274,7 @@ def finders(scalar: Any) -> SimpleNamespace:
     point_inset, edge_inset, around_rim = own.point_inset, own.edge_inset, own.around_rim
     shape = shapes.functions(real)
     to_local, to_world = shape.to_local, shape.to_world
+    box_edge = box_edges.functions(real).box_edge
     point_triangle = closest.functions(real).point_triangle
     corner_x = faces.functions(real).corner_x
     search = shape_touches.functions(real)
@@ -509,22 +510,37 @@ def finders(scalar: Any) -> SimpleNamespace:
         return found, form, foot
 
     @wp.func
-    def edge_on_side(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, target: int, mark: int, n: vec3):
-        """An edge that touches a side of a face."""
+    def edges_across(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, b0: vec3, b1: vec3, n: vec3):
+        """An edge that touches another one, from b0 to b1, with the normal n across both."""
         found = Feature()
         found.way = wp.static(SIDES)
         found.a0 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 0])
         found.a1 = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1])
         found.ball = scene.edge_radius[edge]
         form = Form()
+        form.part = wp.static(SIDE)
+        form.b0 = b0
+        form.b1 = b1
+        form.sign = wp.where(wp.dot(wp.cross(found.a1 - found.a0, b1 - b0), n) < real(0.0), real(-1.0), real(1.0))
+        return found, form
+
+    @wp.func
+    def edge_on_side(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, target: int, mark: int, n: vec3):
+        """An edge that touches a side of a face."""
+        b0 = corner_at(scene, motion, pack, lane, target, scene.face_corner[mark / 3, mark % 3])
+        b1 = corner_at(scene, motion, pack, lane, target, scene.face_corner[mark / 3, (mark % 3 + 1) % 3])
+        found, form = edges_across(scene, motion, pack, lane, edge, b0, b1, n)
         form.radius = scene.face_radius[mark / 3]
         form.part = wp.static(SIDE) + mark % 3
-        form.b0 = corner_at(scene, motion, pack, lane, target, scene.face_corner[mark / 3, mark % 3])
-        form.b1 = corner_at(scene, motion, pack, lane, target, scene.face_corner[mark / 3, (mark % 3 + 1) % 3])
-        form.sign = real(1.0)
-        if wp.dot(wp.cross(found.a1 - found.a0, form.b1 - form.b0), n) < real(0.0):
-            form.sign = real(-1.0)
         return found, form
+
+    @wp.func
+    def edge_on_box(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, target: int, mark: int, n: vec3):
+        """An edge that touches an edge of a box."""
+        x = target_x(scene, motion, pack, lane, target)
+        q = target_q(scene, motion, pack, lane, target)
+        start, way, _outward = box_edge(scene.target_size[target], mark - 1)
+        return edges_across(scene, motion, pack, lane, edge, to_world(x, q, start), to_world(x, q, start + way), n)
 
     @wp.func
     def meeting_of(scene: Scene, motion: Motion, pack: int, lane: int, couple: int, key: int, mark: int, n: vec3):
@@ -556,6 +572,11 @@ def finders(scalar: Any) -> SimpleNamespace:
                 found.second = foot
                 if found.face >= 0 and mark % 3 == 1 and own.rim == 0:
                     found.has_foot = 1
+        elif is_edge and mark > 0 and kind == wp.static(Target.BOX):
+            own, form = edge_on_box(scene, motion, pack, lane, feature, target, mark, n)
+            found.feature = own
+            found.form = form
+            found.second = form
         elif is_edge:
             own, form, behind = edge_on_shape(scene, motion, pack, lane, feature, target, offset % width)
             found.feature = own

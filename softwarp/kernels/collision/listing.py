@@ -306,6 +306,20 @@ def kernels(variant: Variant) -> SimpleNamespace:
         count_out[pack, 0, lane] = count
         overflow_out[pack, 0, lane] = overflow_out[pack, 0, lane] + missed
 
+    @wp.func
+    def place_of(
+        pack: int, lane: int, c: int, count: int, listed: wp.array3d(dtype=wp.int32), key: wp.array3d(dtype=wp.int32)
+    ):
+        """Place of contact c in ascending order of the keys, in which only late contacts are not."""
+        place = int(c)
+        if listed[pack, 0, lane] < count and c < count:
+            own = key[pack, c, lane]
+            place = int(0)
+            for other in range(count):
+                if key[pack, other, lane] < own or (key[pack, other, lane] == own and other < c):
+                    place += 1
+        return place
+
     @wp.kernel(module=module, enable_backward=False)
     def remember(
         # Workspace in
@@ -325,13 +339,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """
         pack, c, lane = wp.tid()
         count = count_in[pack, 0, lane]
-        place = int(c)
-        if listed_in[pack, 0, lane] < count and c < count:
-            key = key_in[pack, c, lane]
-            place = int(0)
-            for other in range(count):
-                if key_in[pack, other, lane] < key or (key_in[pack, other, lane] == key and other < c):
-                    place += 1
+        place = place_of(pack, lane, c, count, listed_in, key_in)
         if c == 0:
             known_count_out[pack, 0, lane] = count
         known_key_out[pack, place, lane] = key_in[pack, c, lane]
@@ -395,5 +403,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     force_out[world, 3 * c + i] = real(0.0)
 
     return SimpleNamespace(
-        collect=collect, call_up=call_up, collect_late=collect_late, remember=remember, load=load, store=store
+        collect=collect,
+        call_up=call_up,
+        collect_late=collect_late,
+        place_of=place_of,
+        put=put,
+        remember=remember,
+        load=load,
+        store=store,
     )

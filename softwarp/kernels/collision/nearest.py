@@ -291,12 +291,14 @@ def searches(scalar: Any) -> SimpleNamespace:
                                 touch = touch_side(scene, motion, pack, lane, target, face, side, p0, p1)
                                 good = wp.abs(touch.distance) < bound
                                 if good and scene.face_corner[face, 2] >= 0:
-                                    good = is_in_cone(scene, motion, pack, lane, target, face, side, touch.normal)
+                                    good = is_in_cone(
+                                        scene, motion, pack, lane, target, face, side, touch.normal, real(CONE)
+                                    )
                                 if good and own:
                                     rest = rest_between(scene, edge, other)
                                     good = rest > clear and touch.distance > -real(BEHIND) * rest
                                 if good:
-                                    good = leaves(scene, motion, pack, lane, edge, rotate(q, touch.normal))
+                                    good = leaves(scene, motion, pack, lane, edge, rotate(q, touch.normal), real(CONE))
                                 if good:
                                     best = touch
                                     bound = wp.abs(touch.distance)
@@ -325,8 +327,8 @@ def searches(scalar: Any) -> SimpleNamespace:
         return gap
 
     @wp.func
-    def leaves(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, n: vec3):
-        """Whether -n leaves the body of a feature edge outwards; always for round edges."""
+    def leaves(scene: Scene, motion: Motion, pack: int, lane: int, edge: int, n: vec3, cone: real):
+        """Whether -n leaves the body of a feature edge outwards, to a sine of ``cone``; always for round edges."""
         good = bool(True)
         left = scene.edge_face[edge, 0]
         right = scene.edge_face[edge, 1]
@@ -334,10 +336,10 @@ def searches(scalar: Any) -> SimpleNamespace:
             e = point_x(scene, motion, pack, lane, scene.edge_point[edge, 1])
             e = wp.normalize(e - point_x(scene, motion, pack, lane, scene.edge_point[edge, 0]))
             n1 = face_normal(scene, motion, pack, lane, left)
-            good = wp.dot(-n, wp.cross(n1, e)) <= real(CONE)
+            good = wp.dot(-n, wp.cross(n1, e)) <= cone
             if right >= 0:
                 n2 = face_normal(scene, motion, pack, lane, right)
-                good = good and wp.dot(-n, wp.cross(e, n2)) <= real(CONE)
+                good = good and wp.dot(-n, wp.cross(e, n2)) <= cone
                 good = good and wp.dot(n, n1 + n2) < real(0.0)
         return good
 
@@ -361,6 +363,7 @@ def searches(scalar: Any) -> SimpleNamespace:
         nearest_face=nearest_face,
         ball_faces=ball_faces,
         nearest_side=nearest_side,
+        leaves=leaves,
         placed=placed,
         box_gap=box_gap,
         with_other=with_other,

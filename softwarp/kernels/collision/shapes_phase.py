@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
-from softwarp.kernels.collision import features, geometry, shape_touches, shapes, touches
+from softwarp.kernels.collision import box_edges, features, geometry, shape_touches, shapes, touches
 from softwarp.model.codes import FAR, Carrier, CoupleColumn, Target
 
 
@@ -26,6 +26,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
     search = shape_touches.functions(real, real is wp.float32 and not variant.world_fastest)
     touch_shape, line_of, part_of = search.touch_shape, search.line_of, search.part_of
     near_part, grid_of = search.near_part, search.grid_of
+    touch_box_edge = box_edges.functions(real).touch_box_edge
     feature = features.functions(real)
     feature_v, is_outside = feature.feature_v, feature.is_outside
     shape = shapes.functions(real)
@@ -169,13 +170,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         count_in: wp.array3d(dtype=wp.int32),
         key_in: wp.array3d(dtype=wp.int32),
         couple_in: wp.array3d(dtype=wp.int32),
+        mark_in: wp.array3d(dtype=wp.int32),
         seats: int,
         found_key_in: wp.array3d(dtype=wp.int32),
         found_touch_in: wp.array3d(dtype=real),
         # Workspace out
         touch_out: wp.array3d(dtype=real),
     ):
-        """Geometry of every ``parts``-th contact with a shape, as ``find`` kept it or anew; without ``seats`` anew."""
+        """Geometry of every ``parts``-th contact with a shape, as ``find`` kept it or anew; without ``seats`` anew.
+
+        A mark is that of ``keeping``: the edge of a box that the feature lies across, from 1 on; else 0.
+        """
         pack, item, lane = wp.tid()
         for c in range(first_in[pack, 0, lane] + item, count_in[pack, 0, lane], parts):
             couple = couple_in[pack, c, lane]
@@ -183,7 +188,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
             kind = scene.target_kind[target]
             if kind < wp.static(Target.MESH) or kind == wp.static(Target.GRID):
                 key = key_in[pack, c, lane]
-                if not kept_touch(pack, c, key, lane, seats, found_key_in, found_touch_in, touch_out):
+                mark = mark_in[pack, c, lane]
+                if mark > 0:
+                    x = target_x(scene, motion, pack, lane, target)
+                    q = target_q(scene, motion, pack, lane, target)
+                    edge = scene.couple[couple, wp.static(CoupleColumn.FIRST)]
+                    edge += (key - scene.couple[couple, wp.static(CoupleColumn.KEY)]) / scene.couple[
+                        couple, wp.static(CoupleColumn.WIDTH)
+                    ]
+                    start, way, radius = line_of(scene, motion, pack, lane, True, edge)
+                    size = scene.target_size[target]
+                    touch = touch_box_edge(size, mark - 1, x, q, start, way, radius, real(1.0))
+                    write_touch(pack, c, lane, touch, touch_out)
+                elif not kept_touch(pack, c, key, lane, seats, found_key_in, found_touch_in, touch_out):
                     x = target_x(scene, motion, pack, lane, target)
                     q = target_q(scene, motion, pack, lane, target)
                     reach = reach_in[pack, couple, lane]

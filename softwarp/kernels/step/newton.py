@@ -12,12 +12,15 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 
 # Rows of the per-world control array
 MERIT, IMBALANCE, STEP, ACCEPTED, FROZEN, BEST, STALL, FAILED, IMPROVED, RETURNING, WITHIN = range(11)
-DEPTH, DEPTH_FIRST, ROWS = range(11, 14)  # of the present iterate and the first one
+DEPTH, DEPTH_FIRST = range(11, 13)  # of the present iterate and the first one
+STUCK, HALTED, MORE, ROWS = range(13, 17)  # has been stuck; takes no further iterations; how many it took
 PROGRESS = 0.8  # of the best merit: what counts as an improvement
 PATIENCE = 5.0  # iterations without progress in which an iterate may be worse than the one before
 REDUCTION, RECOVERY = 0.5, 1.1  # of the share of the pressures' tangent in A after a solve that failed or did not
 LEAST_SHARE = 0.1  # below it the tangent is left out for the rest of the step
 DEPTH_MERIT = 0.1  # what each unit of an iterate's depth beyond the first one adds to its merit
+STUCK_LIMIT = 4  # iterations without progress after which a world may take further ones
+USUAL = 12  # iterations that usually suffice: with fewer at hand, none takes further ones
 STALL_LIMIT = 8  # iterations without progress after which a world that is within rounding counts as converged
 
 
@@ -47,6 +50,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         control_out[pack, wp.static(WITHIN), lane] = real(0.0)
         control_out[pack, wp.static(DEPTH), lane] = real(0.0)
         control_out[pack, wp.static(DEPTH_FIRST), lane] = real(0.0)
+        control_out[pack, wp.static(STUCK), lane] = real(0.0)
+        control_out[pack, wp.static(HALTED), lane] = real(0.0)
+        control_out[pack, wp.static(MORE), lane] = real(0.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def measure_depth(
@@ -103,6 +109,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         Without progress the world goes back to its best iterate, and from there the imbalance must not grow. Where the
         search is not ``monotone`` patience never ends.
         A world whose last solve failed has not converged: it stands where it did, and forces balance at a saddle too.
+        Worlds that have been without progress for long are noted, and those that are halted stay as they are.
         Imbalance knows nothing of a wall that contacts of the iterate before have not held back from. So a depth beyond
         1, and beyond that of the start, adds to the merit by which an iterate is best or has converged.
         """
@@ -131,7 +138,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         improved = first
         returning = bool(False)
         was_solved = control_out[pack, wp.static(FAILED), lane] < real(0.5)
-        if control_out[pack, wp.static(FROZEN), lane] > real(0.5):
+        if control_out[pack, wp.static(FROZEN), lane] + control_out[pack, wp.static(HALTED), lane] > real(0.5):
             accepted = False
         elif accepted:
             control_out[pack, wp.static(STEP), lane] = real(1.0)
@@ -145,6 +152,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     control_out[pack, wp.static(BEST), lane] = merit + deep
                     stall = real(0.0)
                     improved = True
+                if stall >= real(wp.static(float(STUCK_LIMIT))):
+                    control_out[pack, wp.static(STUCK), lane] = real(1.0)
                 control_out[pack, wp.static(STALL), lane] = stall
                 is_still = stall >= real(wp.static(float(STALL_LIMIT))) and is_rounding
                 if was_solved and (merit + deep <= tolerance or (is_still and deep <= tolerance)):
@@ -245,6 +254,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         What it gets grows again from solve to solve. A world that goes back to its best iterate has not left it either.
         """
         pack, lane = wp.tid()
+        if control_out[pack, wp.static(HALTED), lane] > real(0.5):
+            return
         failed = real(0.0)
         for row in range(count):
             if not wp.isfinite(u_in[pack, row, lane]):
@@ -299,6 +310,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """value = reference + step * direction, with the direction of the last accepted iterate."""
         pack, row, lane = wp.tid()
+        if control_in[pack, wp.static(HALTED), lane] > real(0.5):
+            return
         frozen = control_in[pack, wp.static(FROZEN), lane] > real(0.5)
         if frozen or control_in[pack, wp.static(FAILED), lane] > real(0.5):
             value_out[pack, row, lane] = reference_in[pack, row, lane]
@@ -319,10 +332,70 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Multipliers found at a rejected or converged iterate, or in vain, are dropped for those held before."""
         pack, row, lane = wp.tid()
         moving = control_in[pack, wp.static(FROZEN), lane] + control_in[pack, wp.static(FAILED), lane] < real(0.5)
+        moving = moving and control_in[pack, wp.static(HALTED), lane] < real(0.5)
         if moving and control_in[pack, wp.static(ACCEPTED), lane] > real(0.5):
             reference_out[pack, row, lane] = multiplier_out[pack, row, lane]
         else:
             multiplier_out[pack, row, lane] = reference_out[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def begin_further(
+        # Workspace in
+        count_in: wp.array3d(dtype=wp.int32),
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+        stuck_out: wp.array3d(dtype=wp.int32),
+    ):
+        """A world with contacts that has been stuck, and has not converged, has patience again; all others halt."""
+        pack, lane = wp.tid()
+        stuck = control_out[pack, wp.static(STUCK), lane] - control_out[pack, wp.static(FROZEN), lane] > real(0.5)
+        stuck = stuck and count_in[pack, 0, lane] > 0
+        stuck_out[pack, 0, lane] = wp.where(stuck, 1, 0)
+        control_out[pack, wp.static(HALTED), lane] = wp.where(stuck, real(0.0), real(1.0))
+        control_out[pack, wp.static(MORE), lane] = real(0.0)
+        if stuck:
+            control_out[pack, wp.static(STALL), lane] = real(0.0)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def end_further(
+        # Workspace in
+        control_in: wp.array3d(dtype=real),
+        # Workspace out
+        stuck_out: wp.array3d(dtype=wp.int32),
+        returns_out: wp.array3d(dtype=wp.int32),
+    ):
+        """A stuck world that has not converged goes back to where it was before, and keeps no contacts."""
+        pack, lane = wp.tid()
+        returns = stuck_out[pack, 0, lane] != 0 and control_in[pack, wp.static(FROZEN), lane] < real(0.5)
+        returns_out[pack, 0, lane] = wp.where(returns, 1, 0)
+        if returns:
+            stuck_out[pack, 0, lane] = 0
+
+    @wp.kernel(module=module, enable_backward=False)
+    def give_back(
+        # Workspace in
+        returns_in: wp.array3d(dtype=wp.int32),
+        before_in: wp.array3d(dtype=real),
+        # Workspace out
+        value_out: wp.array3d(dtype=real),
+    ):
+        """What a world that goes back had before."""
+        pack, row, lane = wp.tid()
+        if returns_in[pack, 0, lane] != 0:
+            value_out[pack, row, lane] = before_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def count_further(
+        most: int,
+        # Workspace out
+        control_out: wp.array3d(dtype=real),
+    ):
+        """One more iteration has been taken; a world halts after the last."""
+        pack, lane = wp.tid()
+        more = control_out[pack, wp.static(MORE), lane] + real(1.0)
+        control_out[pack, wp.static(MORE), lane] = more
+        if more >= real(most):
+            control_out[pack, wp.static(HALTED), lane] = real(1.0)
 
     @wp.kernel(module=module, enable_backward=False)
     def look_for_others(
@@ -333,10 +406,11 @@ def kernels(variant: Variant) -> SimpleNamespace:
         idle_out: wp.array3d(dtype=wp.int32),
         left_out: wp.array(dtype=wp.int32),
     ):
-        """Whether a world has not converged, which then is not idle; spare ones always are."""
+        """Whether a world goes on, which then is not idle; spare ones always are."""
         pack, lane = wp.tid()
         idle = int(1)
-        if control_in[pack, wp.static(FROZEN), lane] < real(0.5) and spare_in[pack, 0, lane] == 0:
+        stays = control_in[pack, wp.static(FROZEN), lane] + control_in[pack, wp.static(HALTED), lane] > real(0.5)
+        if not stays and spare_in[pack, 0, lane] == 0:
             idle = int(0)
             wp.atomic_max(left_out, 0, 1)  # few worlds
         idle_out[pack, 0, lane] = idle
@@ -349,12 +423,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         value_out: wp.array3d(dtype=real),
     ):
-        """A converged world keeps what it had."""
+        """A world that has converged or halted keeps what it had."""
         pack, row, lane = wp.tid()
-        if control_in[pack, wp.static(FROZEN), lane] > real(0.5):
+        if control_in[pack, wp.static(FROZEN), lane] + control_in[pack, wp.static(HALTED), lane] > real(0.5):
             value_out[pack, row, lane] = held_in[pack, row, lane]
 
     return SimpleNamespace(
+        begin_further=begin_further,
+        count_further=count_further,
+        end_further=end_further,
+        give_back=give_back,
         look_for_others=look_for_others,
         hold_still=hold_still,
         begin=begin,

@@ -36,6 +36,7 @@ from softwarp.kernels.collision import (
     broad,
     bvh,
     geometry,
+    keeping,
     listing,
     shapes_phase,
     sift,
@@ -46,7 +47,7 @@ from softwarp.kernels.collision import (
 from softwarp.kernels.collision.geometry import TOUCH_ROWS
 from softwarp.kernels.rows import looks
 from softwarp.model import memory
-from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier
+from softwarp.model.codes import FAR, SUM_OF_POINTS, WORLD, Carrier, CoupleColumn, Target
 from softwarp.model.contact import CollisionScene, Topology
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.collision.arrays import pack
@@ -90,6 +91,7 @@ class Detector:
         device: Warp device.
         slack: Added to every alarm distance [m], e.g. 2 h^2 times the largest free acceleration.
         patient: Whether contacts of soft bodies within the slack wait in reserve until ``find_late`` sees them overlap.
+        steady: Whether ``find`` may be asked to keep what pressed in earlier iterates of a step.
 
     Attributes:
         contacts: The list that ``find`` fills.
@@ -108,6 +110,7 @@ class Detector:
         slack: float = 0.0,
         *,
         patient: bool = False,
+        steady: bool = False,
     ) -> None:
         if capacity < 1:
             raise ValueError(f"contact capacity must be at least 1 per world, got {capacity}")
@@ -123,6 +126,7 @@ class Detector:
         self.k_near = None if self.k_sift is None else sift_shapes.kernels(variant.lanes)
         self.k_box = box_features.kernels() if self.k_near is not None and variant.lanes > 1 else None
         self.k_strike = strike.kernels(variant)
+        self.k_keep: Any = keeping.kernels(variant) if steady else None
         self.types = geometry.structures(variant.real)
         self.key_count = scene.key_count
         self.contacts = contact_list.allocate(variant, world_count, capacity, device)
@@ -197,6 +201,8 @@ class Detector:
             sifted[self.arrays.node_chunks.numpy()] = 1
         self.sifted = wp.array(sifted, dtype=wp.int32, device=self.device)
         self.object_count, self.couple_count = len(scene.entities), len(scene.couples)
+        kinds = self.scene.target_kind.numpy()[scene.couple_table()[:, CoupleColumn.TARGET]]
+        self.has_boxes = bool((kinds == Target.BOX).any())
         self.has_points = any(entity.frame == SUM_OF_POINTS for entity in scene.entities)
         self.tree_box = real(6 * self.arrays.moving_nodes)
         self.spread = real(12 * self.variant.parts(SPREAD_PARTS) * self.object_count)
@@ -214,6 +220,9 @@ class Detector:
         self.known_count, self.known_key = integer(1), integer(self.capacity)
         self.known_force = real(3 * self.capacity)
         self.couple, self.face, self.known = (integer(self.capacity) for _ in range(3))
+        kept = self.capacity if self.k_keep is not None else 0
+        self.held, self.known_held, self.known_couple, self.known_face = (integer(kept) for _ in range(4))
+        self.stuck = integer(1)
         self.touch = real(TOUCH_ROWS * self.capacity)
         self.seats = 0 if self.variant.world_fastest else SEATS * self.capacity
         self.found_key, self.found_touch = integer(self.seats), real(TOUCH_ROWS * self.seats)
@@ -235,7 +244,9 @@ class Detector:
             dim = self.variant.dim(width, items)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
-    def find(self, x: Rows, pose: Rows, v: Rows, twist: Rows, h: float, pairs: PairParameters) -> None:
+    def find(
+        self, x: Rows, pose: Rows, v: Rows, twist: Rows, h: float, pairs: PairParameters, *, keeps: bool = False
+    ) -> None:
         """Fill ``contacts`` from positions and velocities, starting forces from what was loaded or remembered.
 
         Args:
@@ -245,6 +256,7 @@ class Detector:
             twist: Linear and angular velocities of frames [m/s, rad/s], 6 rows per frame.
             h: Time step [s]; contacts that can close within 1.5 steps are found too. 0 for a static solve.
             pairs: Contact laws of this shard's worlds.
+            keeps: Whether what pressed in earlier iterates of the step stays, where it is remembered and ``steady``.
         """
         a, motion = self.arrays, self._motion(x, pose, v, twist)
         laws = [pairs.distance.real, pairs.alarm.real, self.slack, h]
@@ -259,7 +271,27 @@ class Detector:
         outputs += [self.reserve_key.real, self.reserve_couple.real, self.reserve_face.real]
         self._launch(self.k_list.collect, None, inputs, outputs)
         c.first.zero()
+        if self.k_keep is not None:
+            if keeps:
+                self._keep(motion)
+            else:
+                self.held.zero()
         self._describe(motion, pairs)
+
+    def _keep(self, motion: Any) -> None:
+        """List what pressed in earlier iterates of the step, too."""
+        c, k, stuck = self.contacts, self.k_keep, self.stuck.real
+        known = [self.known_count.real, self.known_key.real, self.known_couple.real]
+        outputs = [c.listed.real, c.count.real, c.overflow.real, c.key.real, c.pair.real]
+        outputs += [self.couple.real, self.face.real, self.known.real, self.held.real]
+        inputs = [self.scene, self.capacity, stuck, motion, *known, self.known_face.real, self.known_held.real]
+        self._launch(k.keep_on_faces, None, inputs, outputs)
+        if self.has_boxes:
+            self._measure(motion)
+            inputs = [self.scene, stuck, motion, c.count.real, c.key.real, self.couple.real, self.touch.real]
+            self._launch(k.mark_boxes, self.capacity, inputs, [self.face.real])
+            inputs = [self.scene, self.capacity, stuck, motion, *known, self.known_face.real, self.known_held.real]
+            self._launch(k.keep_on_boxes, None, inputs, outputs)
 
     def find_late(
         self, x: Rows, pose: Rows, v: Rows, twist: Rows, depth: float, pairs: PairParameters, *, again: bool
@@ -349,7 +381,7 @@ class Detector:
         outputs = [(touch or self.touch).real]
         if a.shape_chunks.size:
             found = [self.seats if is_found else 0, self.found_key.real, self.found_touch.real]
-            self._launch(self.k_shape.measure, parts, [*inputs, *found], outputs)
+            self._launch(self.k_shape.measure, parts, [*inputs, face.real, *found], outputs)
         if a.surface_chunks.size:
             self._launch(self.k_surface.measure, parts, [*inputs, face.real], outputs)
 
@@ -439,12 +471,21 @@ class Detector:
 
     # Memory
 
-    def remember(self) -> None:
-        """Take the forces of ``contacts`` as the first guess of the next ``find``."""
+    def remember(self, *, notes: bool = False) -> None:
+        """Take the forces of ``contacts`` as the first guess of the next ``find``.
+
+        Args:
+            notes: Whether to note what has pressed, too, which that keeps.
+        """
         c = self.contacts
         inputs = [c.listed.real, c.count.real, c.key.real, c.axes.real, c.multiplier.real]
         outputs = [self.known_count.real, self.known_key.real, self.known_force.real]
         self._launch(self.k_list.remember, self.capacity, inputs, outputs)
+        if notes and self.k_keep is not None:
+            inputs = [self.stuck.real, c.listed.real, c.count.real, c.key.real]
+            inputs += [self.couple.real, self.face.real, self.held.real]
+            outputs = [self.known_couple.real, self.known_face.real, self.known_held.real]
+            self._launch(self.k_keep.note, self.capacity, [*inputs, c.multiplier.real], outputs)
 
     def load(self, count: wp.array, key: wp.array, force: wp.array) -> None:
         """Take the first guess from the state, arrays (world, row)."""

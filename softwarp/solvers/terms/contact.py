@@ -45,6 +45,7 @@ class ContactTerm(Term):
             model.capacity,
             shard.device,
             patient=shard.options.newton_iterations == 1 and shard.options.contact_passes > 0,
+            steady=shard.options.newton_iterations > 1,
         )
         self.contacts = self.detector.contacts
         self.late: Rows | None = None
@@ -79,14 +80,14 @@ class ContactTerm(Term):
         laws = [values.real for values in vars(self.pairs).values()]
         s.each_real(s.k_state.check_pairs, self.model.count, laws, [w.flag.real])
 
-    def find(self, h: float, look: float, *, moving: bool, falling: bool) -> None:
+    def find(self, h: float, look: float, *, moving: bool, falling: bool, keeps: bool = False) -> None:
         """Contacts at the trial positions."""
         s = self.shard
         if moving:
-            self.detector.remember()
+            self.detector.remember(notes=keeps)
         if s.options.newton_iterations == 1:  # more iterations look again where the bodies have come to
             self.detector.slack = MARGIN * look * look * self.gravity if falling else 0.0
-        self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], look, self.pairs)
+        self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], look, self.pairs, keeps=keeps)
         if moving:
             self._rebase(h)
 

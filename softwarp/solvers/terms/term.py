@@ -88,7 +88,7 @@ class Term:
     def predict(self, h: float) -> None:
         """Gaps of rows that look ahead with the velocities of the start; needs ``measure``."""
 
-    def find(self, h: float, look: float, *, moving: bool, falling: bool) -> None:
+    def find(self, h: float, look: float, *, moving: bool, falling: bool, keeps: bool = False) -> None:
         """Contacts at the trial positions.
 
         Args:
@@ -96,6 +96,7 @@ class Term:
             look: Time in which bodies come nearer with their velocities [s].
             moving: Velocities were found in this step already; gaps refer to its start.
             falling: Let gravity bring bodies nearer as well.
+            keeps: Contacts that pressed in earlier iterates of the step stay.
         """
 
     # The linear system
