@@ -47,7 +47,7 @@ class System:
         work: Workspace.
         terms: Effects, in the order in which a step walks them.
         linear: Solver of ``A u = b``.
-        free: Bodies whose mass it must not lose, if the scene has any in float32 on a CPU.
+        free: Bodies whose mass it must not lose, if the scene has any in float32.
         rows: Multiplier rows besides contacts.
         multipliers: Laws of all rows.
         watch: Called with the number of every pass of a linear solve, after it, where somebody wants to know.
@@ -70,7 +70,7 @@ class System:
         self.model, self.variant, self.options, self.index = model, variant, options, index
         self.shard = shard = Shard(model, variant, state, control, parameters, options, exact)
         self.state, self.work, self.world_count = state, shard.work, shard.world_count
-        parts = free_parts(model) if variant.real == wp.float32 and model.device == "cpu" else []
+        parts = free_parts(model) if variant.real == wp.float32 else []
         sides = max(1 + model.row_count + more_sides, 3 if parts else 1)
         worlds = (self.world_count, sides, model.device, options.gpu_path)
         contacts = 0 if model.contact is None else model.contact.capacity
