@@ -19,11 +19,27 @@ class InversionTerm(Term):
         super().__init__(shard)
         self.k = inversion.kernels(shard.variant)
         self.k_quadratic = quadratic.kernels(shard.variant)
+        m = shard.model
+        is_alone = bool(m.tet_count) and not m.frame_count and m.reduction is None
+        is_guarded = bool((m.body_guard.numpy() > 0.0).any())
+        self.restrains = is_alone and is_guarded and shard.options.newton_iterations == 1 and not shard.exact
+        self.parts = inversion.PARTS if shard.variant.world_fastest else 1
+        self.stride = shard.rows(self.parts if self.restrains else 1)
 
     def load(self) -> None:
         """Nothing is compressed yet."""
         self.shard.work.compression.zero()
         self.shard.work.inverted.zero()
+
+    def restrain(self, h: float, part: float) -> None:
+        """Worlds with inverted elements go a share of their way where elements would be torn."""
+        if not self.restrains:
+            return
+        s, m, u = self.shard, self.shard.model, self.shard.work.u
+        inputs = [s.lanes, h, m.tet_node, m.tet_size, m.node_dof, s.state.compression, u.real]
+        s.each_real(self.k.strides, self.parts, inputs, [self.stride.real])
+        inputs = [self.parts, m.dof_free, self.stride.real]
+        s.each_real(self.k.hold_back, s.variant.parts(m.dof_count), inputs, [u.real])
 
     def check(self, h: float) -> None:
         """Largest compression of each world, and how many of its elements are inverted."""
