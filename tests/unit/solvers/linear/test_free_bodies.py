@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import softwarp as sw
 from softwarp import meshing
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.linear import free_bodies
 from softwarp.solvers.linear.cholesky import PanelSolver
 from softwarp.solvers.linear.free_bodies import free_parts
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace import rows
 
 WAYS = [
     pytest.param("auto", 1, False, id="wide"),
@@ -123,6 +127,41 @@ def test_matrix_stays(path: str, worlds: int, panels: bool) -> None:
     np.testing.assert_array_equal(system.work.a.real.numpy(), before)
     marked = system.free.excess.real.numpy().transpose(0, 2, 1).reshape(-1)[:worlds] > 0.0
     assert marked.tolist() == [world == worlds - 1 for world in range(worlds)]
+
+
+def test_shares_of_a_gpu() -> None:
+    """Threads that share the dofs of a body find what one thread finds, but for the order in which masses are summed.
+
+    A CPU runs the kernels of a GPU here, whose arrays have the world fastest.
+    """
+    system = crushed(3, "scalar")._systems[0]
+    free, m, w = system.free, system.model, system.work
+    assert free is not None
+    system.tangent()
+    a = w.a.real.numpy().copy()
+    free.mark(w.a)
+    chosen = lanes.variant("cuda", "float32")
+    k = free_bodies.kernels(chosen)
+
+    def send(values: np.ndarray) -> rows.Rows:
+        sent = rows.allocate(chosen, 3, values.shape[1], "cpu")
+        sent.real.assign(values[:, :, 0].T[None])
+        return sent
+
+    def empty(count: int) -> rows.Rows:
+        return rows.allocate(chosen, 3, count, "cpu")
+
+    scale, mass, blocks = send(w.body_mass.real.numpy()), send(w.node_mass.real.numpy()), send(a)
+    share, excess, root = empty(2 * free_bodies.SHARES), empty(1), empty(3)
+    inputs = [free.part_start, free.part_dof, m.dof_node, m.node_body, scale.S, mass.S]
+    wp.launch(k.gauge_shares, (free_bodies.SHARES, 3), [*inputs, blocks.S], [share.S], device="cpu")
+    wp.launch(k.mark, (1, 3), [*inputs, share.S], [blocks.S, excess.S, root.S], device="cpu")
+    expected = free.excess.real.numpy()[:, :, 0].T
+    assert (expected > 0.0).tolist() == [[False, False, True]]
+    np.testing.assert_allclose(excess.real.numpy()[0], expected, rtol=1e-6)
+    np.testing.assert_array_equal(root.real.numpy()[0], free.root.real.numpy()[:, :, 0].T)
+    np.testing.assert_allclose(blocks.real.numpy()[0], w.a.real.numpy()[:, :, 0].T, rtol=1e-6)
+    np.testing.assert_array_equal(blocks.real.numpy()[0, :, :2], a[:2, :, 0].T)
 
 
 @pytest.mark.parametrize("world", [0, 4])
