@@ -150,14 +150,16 @@ def kernels(variant: Variant) -> SimpleNamespace:
         stride_in: wp.array3d(dtype=real),
         # Workspace out
         u_out: wp.array3d(dtype=real),
+        held_out: wp.array3d(dtype=wp.int32),
     ):
-        """Worlds whose corners would move too far apart go a share of their way."""
+        """Worlds whose corners would move too far apart go a share of their way, and are told."""
         pack, item, lane = wp.tid()
         most = real(0.0)
         for part in range(parts):
             most = wp.max(most, stride_in[pack, part, lane])
         if most > real(FARTHEST * FARTHEST):
             share = real(FARTHEST) / wp.sqrt(most)
+            held_out[pack, 0, lane] = 1
             first = int(0)
             last = dof_free.shape[0]
             if wp.static(world_fastest):

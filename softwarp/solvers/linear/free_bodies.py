@@ -95,12 +95,17 @@ def free_parts(model: Model) -> list[np.ndarray]:
     others = (model.quadratic, model.membranes, model.reduction, model.cavities, model.tractions)
     if not model.tet_count or any(other is not None for other in others):
         return []
-    node, parent = model.dof_node.numpy(), model.symbolic.parent
-    root = np.arange(parent.size)
-    for j in np.flatnonzero(parent >= 0)[::-1]:
-        root[j] = root[parent[j]]
+    node, root = model.dof_node.numpy(), roots(model.symbolic.parent)
     is_held = (node >= model.own_node_count) | ~model.dof_free.numpy().reshape(-1, 3).all(axis=1)
     body, own = model.node_body.numpy(), model.node_dof.numpy()[: model.own_node_count]
     soft = ~is_held
     is_held[soft] |= np.isin(body[node[soft]], body[: own.size][own < 0])
     return [np.flatnonzero(root == j) for j in np.setdiff1d(root, root[is_held])]
+
+
+def roots(parent: np.ndarray) -> np.ndarray:
+    """Last dof of the elimination tree of every dof, from the next one above it, -1 where there is none."""
+    root = np.arange(parent.size)
+    for j in np.flatnonzero(parent >= 0)[::-1]:
+        root[j] = root[parent[j]]
+    return root
