@@ -11,6 +11,9 @@ import torch
 import softwarp as sw
 from softwarp import meshing
 from softwarp.envs.registry import make
+from softwarp.gradients.refusals import Diverged
+from softwarp.gradients.rollout import Rollout
+from softwarp.gradients.worlds import DifferentiableWorlds
 
 YOUNGS, NU = 1.0e5, 0.4
 MU, LAM = YOUNGS / 2.8, YOUNGS * NU / (1.4 * 0.2)
@@ -216,3 +219,29 @@ def test_steps_of_inverted_worlds_are_bounded(precision: str) -> None:
     assert torch.equal(x0[others], x1[others]) and torch.equal(v0[others], v1[others])
     factor = 0.5 / free[3]
     torch.testing.assert_close(v1[3], factor * v0[3], rtol=1e-4, atol=1e-4)
+
+
+def test_rollouts_refuse_steps_that_were_held_back() -> None:
+    """They take these steps to the bit; a gradient knows nothing of what was held back, so that there is none."""
+    sim = cube(2, inversion_guard=0.4)
+    middle = int((torch.as_tensor(sim.model.node_rest) - 0.05).norm(dim=1).argmin())
+    sim.node_x[1, middle, 0] += 0.06
+    sim.step()
+    assert sim.status.tolist() == [0, -1]
+    sim.node_v[1] = 60.0 * torch.as_tensor(sim.model.node_rest - 0.05).to(sim.node_v)
+    sim.node_v[1, 0] += 30.0
+    worlds, rollout = DifferentiableWorlds(sim), Rollout(sim)
+    worlds.start()
+    worlds.step()
+    assert worlds.held.tolist() == [False, True]
+    start = sim.snapshot()
+    sim.step()
+    assert torch.equal(worlds.state["node_x"], sim.node_x)
+    sim.restore(start)
+    with pytest.raises(Diverged, match="steps were held back in world 1 and 0 others"):
+        rollout(steps=1)
+    sim.reset()
+    rollout(steps=1)
+    worlds.start()
+    worlds.step()
+    assert not worlds.held.any()
