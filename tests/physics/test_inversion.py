@@ -13,7 +13,8 @@ from softwarp import meshing
 from softwarp.envs.registry import make
 from softwarp.gradients.refusals import Diverged
 from softwarp.gradients.rollout import Rollout
-from softwarp.gradients.worlds import DifferentiableWorlds
+from softwarp.gradients.worlds import DifferentiableWorlds, held_flags, told_worlds
+from softwarp.solvers import partition
 
 YOUNGS, NU = 1.0e5, 0.4
 MU, LAM = YOUNGS / 2.8, YOUNGS * NU / (1.4 * 0.2)
@@ -27,6 +28,7 @@ def cube(
     dt: float = 0.01,
     clamped: bool = False,
     device: str = "cpu",
+    threads: int | None = None,
     **material: Any,
 ) -> sw.Simulation:
     """A silicone cube of 0.1 m in 8 cells, without gravity, free or clamped at its bottom."""
@@ -37,7 +39,7 @@ def cube(
     body = builder.add_tets(mesh, material=sw.Corotational(YOUNGS, NU, **options), density=1000.0, element=element)
     if clamped:
         builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-9)))
-    return sw.Simulation(builder.finalize(worlds, device, precision), dt)
+    return sw.Simulation(builder.finalize(worlds, device, precision), dt, threads=threads)
 
 
 def volume_ratios(sim: sw.Simulation) -> torch.Tensor:
@@ -245,3 +247,19 @@ def test_rollouts_refuse_steps_that_were_held_back() -> None:
     worlds.start()
     worlds.step()
     assert not worlds.held.any()
+
+
+@pytest.mark.parametrize("world", [1, 39])
+def test_world_that_was_held_back_is_named(world: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among shards that one thread steps in turns, in the same workspace."""
+    monkeypatch.setattr(partition, "SHARD_BYTES", 1.0)
+    sim = cube(40, inversion_guard=0.4, precision="float32", threads=1)
+    assert len(sim.systems) == 5
+    middle = int((torch.as_tensor(sim.model.node_rest) - 0.05).norm(dim=1).argmin())
+    sim.node_x[world, middle, 0] += 0.06
+    sim.step()
+    sim.node_v[world] = 60.0 * torch.as_tensor(sim.model.node_rest - 0.05).to(sim.node_v)
+    sim.node_v[world, 0] += 30.0
+    sim.step()
+    told = told_worlds(held_flags(sim.systems), sim.status != 0)
+    assert told.nonzero().flatten().tolist() == [world]

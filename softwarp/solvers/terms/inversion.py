@@ -33,7 +33,8 @@ class InversionTerm(Term):
         self.parts = inversion.PARTS if shard.variant.world_fastest else 1
         self.stride = shard.rows(self.parts if self.restrains else 1)
         flags = (shard.packs, 1, shard.lanes)
-        self.held = memory.zeros(flags, wp.int32, shard.device) if self.restrains else None
+        with memory.lasting():  # whoever reads it does so after all shards
+            self.held = memory.zeros(flags, wp.int32, shard.device) if self.restrains else None
         self.dashpots: Dashpots | None = None
         if self.held is not None and shard.variant.real == wp.float32:
             self.dashpots = Dashpots(shard, self.held)
