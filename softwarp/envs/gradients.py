@@ -12,7 +12,8 @@ The environment takes its own steps, captured on CUDA as always; what these star
 through the sub-steps from the last to the first with the adjoint of docs/theory/adjoint.md. What an action commands,
 what is observed and rewarded are the task's own formulas (``DifferentiableTask``), differentiated by torch. A world
 whose episode ends starts from constants: no gradient passes a reset. Worlds that failed have gradient 0; so have those
-in which contacts that repeat each other slipped, whose forces are not unique, and a warning tells of the first ones.
+in which contacts that repeat each other slipped, whose forces are not unique, and those in which a step was held back
+because elements were inside out or nearly flat; a warning tells of the first ones.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from torch import Tensor
 from softwarp.envs.sums import length_of
 from softwarp.gradients.refusals import missing
 from softwarp.gradients.rollout import Markers
-from softwarp.gradients.worlds import DifferentiableWorlds
+from softwarp.gradients.worlds import DifferentiableWorlds, held_flags, told_worlds
 from softwarp.model.codes import Status
 from softwarp.model.memory import free_bytes
 from softwarp.simulation import Simulation
@@ -42,6 +43,11 @@ if TYPE_CHECKING:
     from softwarp.envs.base import SoftEnv
 
 _FAILED = int(Status.NONFINITE)
+_REPEATS = (
+    "contacts that repeat each other slipped, as along an edge that lies flat on a face; how they share their load is "
+    "not unique, and friction depends on it"
+)
+_HELD = "a step was held back, because elements are inside out or nearly flat; gradients know nothing of that"
 _NOW = "now "  # begins the keys of what the next action starts from
 ROOM = 0.25  # of a device's memory that kept factors may take
 
@@ -206,7 +212,8 @@ class EnvSteps:
             those of a window fit into a quarter of the device's memory.
 
     Attributes:
-        unsure: Worlds in which a gradient of the last backward pass was not unique and is 0, bool, (world,).
+        unsure: Worlds in which a gradient of the last backward pass is 0 because it was not unique, or because a
+            sub-step was held back where elements are inside out or nearly flat, bool, (world,).
 
     Raises:
         ValueError: If a task, a scene or an option has no gradient; the message names it and the way out.
@@ -218,7 +225,8 @@ class EnvSteps:
         self.env = env
         self.worlds = DifferentiableWorlds(env.sim)
         self.maps = _Maps(env)
-        self.unsure, self._has_warned = torch.zeros_like(self.worlds.failed), False
+        self.unsure = torch.zeros_like(self.worlds.failed)
+        self._warned: set[str] = set()
         needed = self.worlds.solution_bytes * env.action_repeat * window
         self.factors = needed <= ROOM * free_bytes(env.device) if factors is None else factors
         self.real = env.sim.node_x.dtype
@@ -226,6 +234,7 @@ class EnvSteps:
         if self.factors:
             parts = _solutions(env.sim)
             self._solution = [wp.to_torch(part, requires_grad=False) for part in parts]
+        self._held = held_flags(env.sim.systems)
         self._spare: list[list[Tensor]] = []  # room for factors on a CPU: touching new memory takes long
         self._room: list[Tensor] | None = None  # for those of the present action
         views, worlds = env.sim.state_tensors(), self.worlds
@@ -329,6 +338,8 @@ class EnvSteps:
         room = self._room if self._room is not None else self._make_room()
         status = []
         parameters = {f"parameter {name}": view.clone() for name, view in self._parameters.items()}
+        for _, flags in self._held:
+            flags.zero_()
         for substep in range(env.action_repeat):
             for name, view in self._started.items():
                 kept[name].append(view.clone())
@@ -339,12 +350,14 @@ class EnvSteps:
             for held, part in zip(room, self._solution, strict=True):
                 held[substep].copy_(part)
         env._status.copy_(torch.stack(status).amax(dim=0))
+        held = told_worlds(self._held, self.worlds.failed)
         led_to = {f"end {name}": view.clone() for name, view in self._state.items()}
         after = env._cut_episodes(env._account(action), cut)
         ended = after["done"].squeeze(-1)
         if env.captures.are_on or bool(ended.any()):
             env._begin(ended)
         found = {f"start {name}": torch.stack(values) for name, values in kept.items()}
+        found["held"] = held
         if self._room is None:
             found |= {f"solution {place}": part for place, part in enumerate(room)}
         found |= parameters | led_to | {f"after {key}": value for key, value in after.items()}
@@ -377,26 +390,28 @@ class EnvSteps:
                 found[substep].copy_(torch.where(_along(good, found[substep]), gradients[f"command_{name}"], 0.0))
         if room is not None and good.device.type == "cpu":
             self._spare.append(room)
-        unsure = good & (worlds.unsure | worlds.adrift)
-        good = good & ~unsure
-        self._tell(unsure)
+        unsure, held = good & (worlds.unsure | worlds.adrift), good & record["held"]
+        good = good & ~unsure & ~held
+        self._tell(unsure, held)
         by_commands = [torch.where(good[:, None], found.flatten(2), 0.0).reshape(found.shape) for found in by_commands]
         by_state = [torch.where(_along(good, gradients[name]), gradients[name], 0.0) for name in self._state]
         return by_state, by_commands
 
-    def _tell(self, unsure: Tensor) -> None:
-        """Warn of the first worlds whose gradients are not unique."""
-        self.unsure = self.unsure | unsure
-        if self._has_warned or not bool(unsure.any()):
+    def _tell(self, unsure: Tensor, held: Tensor) -> None:
+        """Warn of the first worlds whose gradients are not unique, and of the first whose steps were held back."""
+        self.unsure = self.unsure | unsure | held
+        if len(self._warned) == 2 or not bool((unsure | held).any()):
             return
-        self._has_warned = True
-        found = unsure.nonzero().flatten().tolist()
-        warnings.warn(
-            f"{type(self.env).__name__}: in world {found[0]} and {len(found) - 1} others contacts that repeat each "
-            "other slipped, as along an edge that lies flat on a face; how they share their load is not unique, and "
-            "friction depends on it: gradients are 0 there, and EnvSteps.unsure names such worlds from now on",
-            stacklevel=2,
-        )
+        for found, why in ((unsure, _REPEATS), (held, _HELD)):
+            listed = found.nonzero().flatten().tolist()
+            if not listed or why in self._warned:
+                continue
+            self._warned.add(why)
+            warnings.warn(
+                f"{type(self.env).__name__}: in world {listed[0]} and {len(listed) - 1} others {why}: gradients are 0 "
+                "there, and EnvSteps.unsure names such worlds from now on",
+                stacklevel=2,
+            )
 
 
 class _Substeps(torch.autograd.Function):

@@ -125,6 +125,8 @@ def check_steps(call: Call) -> None:
     worlds, plan = call.worlds, call.plan
     _check_failed(worlds.failed)
     _check_unfinished(worlds.unfinished)
+    if worlds.holds_back:
+        _check_held(worlds.held)
     if "control.body_velocity" in plan.names:
         _check_lagging(worlds.lagging)
     _check_room(worlds.state["contact_overflow"], worlds.model)
@@ -149,6 +151,16 @@ def _check_unfinished(unfinished: torch.Tensor) -> None:
             f"rollout: Newton's iterations of a step ended above their tolerance in world {worlds[0]} and "
             f"{len(worlds) - 1} others; a gradient is that of a step that has converged: take more newton_iterations, "
             "a larger newton_tolerance, a shorter dt, or newton_iterations=1"
+        )
+
+
+def _check_held(held: torch.Tensor) -> None:
+    worlds = held.nonzero().flatten().tolist()
+    if worlds:
+        raise Diverged(
+            f"rollout: steps were held back in world {worlds[0]} and {len(worlds) - 1} others, where elements are "
+            "inside out or nearly flat (Simulation.compression), of which a gradient knows nothing; start from where "
+            "none are, or take a shorter dt or milder commands there"
         )
 
 

@@ -45,6 +45,7 @@ from softwarp.threads import Workers, alone
 if TYPE_CHECKING:
     import torch
 
+Flags = list[tuple[tuple[int, int], "torch.Tensor"]]  # those of some worlds each, not 0 where there is something
 LAG = 1.0e-3  # m/s and rad/s, beside commands of up to 1: what rounding may make of a velocity
 
 
@@ -185,6 +186,8 @@ class DifferentiableWorlds:
         failed: Worlds that a step has failed in since ``start``, bool, (world,).
         unfinished: Likewise, worlds where the iterations of a step ended above their tolerance.
         lagging: Likewise, worlds where a kinematic body had another velocity than its command.
+
+    ``held`` names, likewise, worlds where a step was held back because elements were inside out.
     """
 
     @alone
@@ -206,9 +209,12 @@ class DifferentiableWorlds:
             self.names = (*self.names, *MODES)
             if model.reduction.floating is not None:
                 self.names = (*self.names, *FLOATING)
-        self.memory = tuple(name for name in memory if name not in self.names)
         self._index = index = AdjointIndex.of(model)
         self._twins = twins = sim.make_twins(*room.worlds)
+        self._held = held_flags([system for _, system in twins])
+        if self._held:
+            memory = (*memory, "compression")  # worlds that begin a step inverted may be held back
+        self.memory = tuple(name for name in memory if name not in self.names)
         steppers = [stepper(system, self.h) for _, system in twins]
         parts = [room.part(each) for each, _ in twins]
         pulls = [
@@ -271,6 +277,8 @@ class DifferentiableWorlds:
         self.unfinished.zero_()
         self.forget()
         self.lagging.zero_()
+        for _, told in self._held:
+            told.zero_()
         self.pressed.zero_()
         self.state["contact_overflow"].zero_()
 
@@ -331,23 +339,27 @@ class DifferentiableWorlds:
     @property
     def adrift(self) -> torch.Tensor:
         """Worlds whose gradients did not come to stay since ``start``, bool, (world,)."""
-        return self._told(self._adrift)
+        return told_worlds(self._adrift, self.failed)
 
     @property
     def unsure(self) -> torch.Tensor:
         """Worlds where contacts that slipped repeated each other since ``start``, bool, (world,)."""
-        return self._told(self._unsure)
+        return told_worlds(self._unsure, self.failed)
+
+    @property
+    def holds_back(self) -> bool:
+        """Whether steps of this scene may be held back."""
+        return bool(self._held)
+
+    @property
+    def held(self) -> torch.Tensor:
+        """Worlds where a step was held back since ``start``, of which gradients know nothing, bool, (world,)."""
+        return told_worlds(self._held, self.failed)
 
     def forget(self) -> None:
         """Neither ``adrift`` nor ``unsure`` has any world from now on."""
         for _, told in (*self._adrift, *self._unsure):
             told.zero_()
-
-    def _told(self, held: list[tuple[tuple[int, int], torch.Tensor]]) -> torch.Tensor:
-        found = self.failed.new_zeros(self.failed.shape)
-        for (begin, end), told in held:
-            found[begin:end].logical_or_(told[: end - begin] != 0)
-        return found
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
         """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
@@ -453,3 +465,23 @@ def _flags(array: wp.array) -> torch.Tensor:
     """A flag of every world, as the adjoints have them."""
     flags: torch.Tensor = wp.to_torch(array, requires_grad=False).flatten()
     return flags
+
+
+def held_flags(systems: Sequence[System]) -> Flags:
+    """Where the systems of all worlds, in their order, tell of steps that were held back."""
+    found: Flags = []
+    begin = 0
+    for system in systems:
+        end = begin + system.world_count
+        if system.inversion is not None and system.inversion.held is not None:
+            found.append(((begin, end), _flags(system.inversion.held)))
+        begin = end
+    return found
+
+
+def told_worlds(flags: Flags, like: torch.Tensor) -> torch.Tensor:
+    """Worlds that some flags tell of, bool, in the shape of ``like``, (world,)."""
+    found = like.new_zeros(like.shape)
+    for (begin, end), told in flags:
+        found[begin:end].logical_or_(told[: end - begin] != 0)
+    return found

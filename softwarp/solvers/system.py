@@ -22,6 +22,7 @@ from softwarp.solvers.linear.free_bodies import FreeBodies, free_parts
 from softwarp.solvers.multipliers import BoundedMultipliers, ContactMultipliers, Multipliers, StaticRows
 from softwarp.solvers.options import Options
 from softwarp.solvers.terms.contact import ContactTerm
+from softwarp.solvers.terms.inversion import InversionTerm
 from softwarp.solvers.terms.table import terms_of
 from softwarp.solvers.terms.term import Pace
 from softwarp.solvers.workspace.rows import Rows
@@ -47,7 +48,8 @@ class System:
         work: Workspace.
         terms: Effects, in the order in which a step walks them.
         linear: Solver of ``A u = b``.
-        free: Bodies whose mass it must not lose, if the scene has any in float32 on a CPU.
+        inversion: What looks for elements that are inside out.
+        free: Bodies whose mass it must not lose, if the scene has any in float32.
         rows: Multiplier rows besides contacts.
         multipliers: Laws of all rows.
         watch: Called with the number of every pass of a linear solve, after it, where somebody wants to know.
@@ -70,7 +72,7 @@ class System:
         self.model, self.variant, self.options, self.index = model, variant, options, index
         self.shard = shard = Shard(model, variant, state, control, parameters, options, exact)
         self.state, self.work, self.world_count = state, shard.work, shard.world_count
-        parts = free_parts(model) if variant.real == wp.float32 and model.device == "cpu" else []
+        parts = free_parts(model) if variant.real == wp.float32 else []
         sides = max(1 + model.row_count + more_sides, 3 if parts else 1)
         worlds = (self.world_count, sides, model.device, options.gpu_path)
         contacts = 0 if model.contact is None else model.contact.capacity
@@ -83,6 +85,7 @@ class System:
         quadratic = model.quadratic
         self.consistent_mass = nobody if quadratic is None else [quadratic.mass_body, quadratic.mass_volume]
         self.terms = terms_of(shard)
+        self.inversion = next((term for term in self.terms if isinstance(term, InversionTerm)), None)
         self.rows = StaticRows(shard, self.linear, self.terms)
         self.unbounded = sorted(row for term in self.terms for row in term.unbounded)
         self.contact = next((term for term in self.terms if isinstance(term, ContactTerm)), None)
@@ -249,9 +252,9 @@ class System:
         self._mask(a_upper)
 
     def right_hand_side(self, f_scale: float, inertia: bool, moving: bool) -> None:
-        """b of ``kernels.elements.assembly``; needs ``forces`` and ``tangent``. Completes A with the tangent of loads.
+        """b of ``kernels.elements.assembly``; needs ``forces`` and ``tangent``. Completes A.
 
-        That comes after b, because damping is proportional to the stiffness of elements only.
+        Tangents of loads and dashpots come after b, because damping is proportional to the stiffness of elements only.
         """
         self._impulses(f_scale, inertia, moving)
         for term in self.terms:

@@ -11,6 +11,10 @@ import torch
 import softwarp as sw
 from softwarp import meshing
 from softwarp.envs.registry import make
+from softwarp.gradients.refusals import Diverged
+from softwarp.gradients.rollout import Rollout
+from softwarp.gradients.worlds import DifferentiableWorlds, held_flags, told_worlds
+from softwarp.solvers import partition
 
 YOUNGS, NU = 1.0e5, 0.4
 MU, LAM = YOUNGS / 2.8, YOUNGS * NU / (1.4 * 0.2)
@@ -24,6 +28,7 @@ def cube(
     dt: float = 0.01,
     clamped: bool = False,
     device: str = "cpu",
+    threads: int | None = None,
     **material: Any,
 ) -> sw.Simulation:
     """A silicone cube of 0.1 m in 8 cells, without gravity, free or clamped at its bottom."""
@@ -34,7 +39,7 @@ def cube(
     body = builder.add_tets(mesh, material=sw.Corotational(YOUNGS, NU, **options), density=1000.0, element=element)
     if clamped:
         builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-9)))
-    return sw.Simulation(builder.finalize(worlds, device, precision), dt)
+    return sw.Simulation(builder.finalize(worlds, device, precision), dt, threads=threads)
 
 
 def volume_ratios(sim: sw.Simulation) -> torch.Tensor:
@@ -182,3 +187,79 @@ def test_trunk_stays_upright_whatever_is_commanded() -> None:
         worst = max(worst, float(env.sim.compression.max()))
         assert not env.sim.inverted_count.any()
     assert worst > 0.7  # so far that the guard has held
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_steps_of_inverted_worlds_are_bounded(precision: str) -> None:
+    """Corners that fly apart by more than half an edge a step do not where elements are inside out, and do elsewhere.
+
+    All velocities of such a world are shortened by the same factor; the other worlds keep their bits.
+    """
+    ends = []
+    for restrained in (False, True):
+        sim = cube(10, precision=precision, inversion_guard=0.4)
+        term = next(t for t in sim._systems[0].terms if hasattr(t, "restrains"))
+        assert term.restrains
+        term.restrains = restrained
+        middle = int((torch.as_tensor(sim.model.node_rest) - 0.05).norm(dim=1).argmin())
+        sim.node_x[3, middle, 0] += 0.06
+        sim.step()
+        assert sim.status.tolist() == [0, 0, 0, -1, 0, 0, 0, 0, 0, 0]
+        sim.node_v[2:4] = 60.0 * torch.as_tensor(sim.model.node_rest - 0.05).to(sim.node_v)
+        sim.node_v[2:4, 0] += 30.0
+        before = sim.node_x.clone()
+        sim.step()
+        assert bool((sim.status < 3).all())
+        corners = torch.as_tensor(sim.model.tet_corners.astype(np.int64))
+        moved = (sim.node_x - before)[:, corners]
+        apart = (moved[:, :, 1:] - moved[:, :, :1]).norm(dim=-1).amax(dim=(1, 2)) / 0.05
+        ends.append((apart, sim.node_x.clone(), sim.node_v.clone()))
+    (free, x0, v0), (held, x1, v1) = ends
+    assert float(free[2]) > 0.6 and float(free[3]) > 0.6
+    assert float(held[3]) == pytest.approx(0.5, rel=1e-4)
+    others = [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert torch.equal(x0[others], x1[others]) and torch.equal(v0[others], v1[others])
+    factor = 0.5 / free[3]
+    torch.testing.assert_close(v1[3], factor * v0[3], rtol=1e-4, atol=1e-4)
+
+
+def test_rollouts_refuse_steps_that_were_held_back() -> None:
+    """They take these steps to the bit; a gradient knows nothing of what was held back, so that there is none."""
+    sim = cube(2, inversion_guard=0.4)
+    middle = int((torch.as_tensor(sim.model.node_rest) - 0.05).norm(dim=1).argmin())
+    sim.node_x[1, middle, 0] += 0.06
+    sim.step()
+    assert sim.status.tolist() == [0, -1]
+    sim.node_v[1] = 60.0 * torch.as_tensor(sim.model.node_rest - 0.05).to(sim.node_v)
+    sim.node_v[1, 0] += 30.0
+    worlds, rollout = DifferentiableWorlds(sim), Rollout(sim)
+    worlds.start()
+    worlds.step()
+    assert worlds.held.tolist() == [False, True]
+    start = sim.snapshot()
+    sim.step()
+    assert torch.equal(worlds.state["node_x"], sim.node_x)
+    sim.restore(start)
+    with pytest.raises(Diverged, match="steps were held back in world 1 and 0 others"):
+        rollout(steps=1)
+    sim.reset()
+    rollout(steps=1)
+    worlds.start()
+    worlds.step()
+    assert not worlds.held.any()
+
+
+@pytest.mark.parametrize("world", [1, 39])
+def test_world_that_was_held_back_is_named(world: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among shards that one thread steps in turns, in the same workspace."""
+    monkeypatch.setattr(partition, "SHARD_BYTES", 1.0)
+    sim = cube(40, inversion_guard=0.4, precision="float32", threads=1)
+    assert len(sim.systems) == 5
+    middle = int((torch.as_tensor(sim.model.node_rest) - 0.05).norm(dim=1).argmin())
+    sim.node_x[world, middle, 0] += 0.06
+    sim.step()
+    sim.node_v[world] = 60.0 * torch.as_tensor(sim.model.node_rest - 0.05).to(sim.node_v)
+    sim.node_v[world, 0] += 30.0
+    sim.step()
+    told = told_worlds(held_flags(sim.systems), sim.status != 0)
+    assert told.nonzero().flatten().tolist() == [world]

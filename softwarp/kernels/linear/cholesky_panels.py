@@ -530,4 +530,5 @@ def kernels(variant: Variant) -> SimpleNamespace:
         forward_panels=forward_panels,
         backward_panels=backward_panels,
         block=block,
+        store=store,
     )

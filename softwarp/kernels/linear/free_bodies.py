@@ -12,9 +12,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
+from softwarp.kernels.linear import cholesky_panels
 
 BEARABLE = 2.0**16  # largest entry of A in masses of the body, up to which the mass keeps eight bits in float32
 ROOT_SHARE = 2.0**-18  # of the excess, which the last block receives while the factor is found: more than rounding
+SHARES = 32  # threads of a GPU that share the dofs of a body
 
 
 @cache
@@ -28,6 +30,64 @@ def kernels(variant: Variant) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
 
+    @wp.func
+    def gauge(
+        part_start: wp.array(dtype=wp.int32),
+        part_dof: wp.array(dtype=wp.int32),
+        dof_node: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        body_mass_scale: wp.array2d(dtype=S),
+        node_mass: wp.array2d(dtype=S),
+        a: wp.array2d(dtype=S),
+        w: int,
+        part: int,
+        first: int,
+        stride: int,
+    ):
+        """Largest diagonal entry of A among some dofs of a body, and their mass."""
+        largest = S(real(0.0))
+        mass = S(real(0.0))
+        for k in range(part_start[part] + first, part_start[part + 1], stride):
+            dof = part_dof[k]
+            node = dof_node[dof]
+            mass += mul(body_mass_scale[w, node_body[node]], node_mass[w, node])
+            for c in range(3):
+                largest = wp.max(largest, a[w, 9 * dof + 4 * c])
+        return largest, mass
+
+    @wp.kernel(module=module, enable_backward=False)
+    def gauge_shares(
+        # Symbolic
+        part_start: wp.array(dtype=wp.int32),
+        part_dof: wp.array(dtype=wp.int32),
+        # Model
+        dof_node: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mass_scale_in: wp.array2d(dtype=S),
+        node_mass_in: wp.array2d(dtype=S),
+        a_in: wp.array2d(dtype=S),
+        # Workspace out
+        share_out: wp.array2d(dtype=S),
+    ):
+        """Largest entry and mass of every ``SHARES``-th dof of a body, on a GPU: one thread would wait for each."""
+        item, w = wp.tid()
+        largest, mass = gauge(
+            part_start,
+            part_dof,
+            dof_node,
+            node_body,
+            body_mass_scale_in,
+            node_mass_in,
+            a_in,
+            w,
+            item // SHARES,
+            item % SHARES,
+            SHARES,
+        )
+        share_out[w, 2 * item] = largest
+        share_out[w, 2 * item + 1] = mass
+
     @wp.kernel(module=module, enable_backward=False)
     def mark(
         # Symbolic
@@ -39,6 +99,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace in
         body_mass_scale_in: wp.array2d(dtype=S),
         node_mass_in: wp.array2d(dtype=S),
+        share_in: wp.array2d(dtype=S),
         # Workspace out
         a_out: wp.array2d(dtype=S),
         excess_out: wp.array2d(dtype=S),
@@ -50,12 +111,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
             part, w = wp.tid()
         largest = S(real(0.0))
         mass = S(real(0.0))
-        for k in range(part_start[part], part_start[part + 1]):
-            dof = part_dof[k]
-            node = dof_node[dof]
-            mass += mul(body_mass_scale_in[w, node_body[node]], node_mass_in[w, node])
-            for c in range(3):
-                largest = wp.max(largest, a_out[w, 9 * dof + 4 * c])
+        if wp.static(world_fastest):
+            for item in range(part * SHARES, (part + 1) * SHARES):
+                largest = wp.max(largest, share_in[w, 2 * item])
+                mass += share_in[w, 2 * item + 1]
+        else:
+            largest, mass = gauge(
+                part_start, part_dof, dof_node, node_body, body_mass_scale_in, node_mass_in, a_out, w, part, 0, 1
+            )
         excess = wp.max(largest - mass * real(BEARABLE), S(real(0.0)))
         excess_out[w, part] = excess
         root = part_dof[part_start[part + 1] - 1]
@@ -252,4 +315,97 @@ def kernels(variant: Variant) -> SimpleNamespace:
             for c in range(3):
                 y_out[pack, 3 * i + c, lane] = y_out[pack, 3 * i + c, lane] + mass * real(left[c])
 
-    return SimpleNamespace(mark=mark, mend_root=mend_root, residual=residual, balance=balance)
+    return SimpleNamespace(
+        balance=balance,
+        gauge_shares=gauge_shares,
+        mark=mark,
+        mend_root=mend_root,
+        residual=residual,
+        side_block=side_block,
+        inverse_root=inverse_root,
+        restore=restore,
+    )
+
+
+@cache
+def panel_kernels(variant: Variant) -> SimpleNamespace:
+    """The same for a factor in panels, whose substitution is that of all other sides."""
+    real = variant.real
+    module = variant.module("free_bodies.panel")
+    k = kernels(variant)
+    side_block, inverse_root, restore = k.side_block, k.inverse_root, k.restore
+    shared = cholesky_panels.kernels(variant)
+    block, store = shared.block, shared.store
+
+    @wp.kernel(module=module, enable_backward=False)
+    def place_masses(
+        size: int,
+        parts: int,
+        # Symbolic
+        dof_part: wp.array(dtype=wp.int32),
+        # Model
+        dof_node: wp.array(dtype=wp.int32),
+        node_body: wp.array(dtype=wp.int32),
+        # Workspace in
+        body_mass_scale_in: wp.array3d(dtype=real),
+        node_mass_in: wp.array3d(dtype=real),
+        excess_in: wp.array3d(dtype=real),
+        # Workspace out
+        skipped_out: wp.array2d(dtype=wp.int32),
+        y_out: wp.array3d(dtype=real),
+    ):
+        """Mass of the dofs of marked bodies along three axes, one right-hand side each; worlds without are skipped."""
+        pack, i, lane = wp.tid()
+        marked = int(0)
+        for part in range(parts):
+            if excess_in[pack, part, lane] > real(0.0):
+                marked = 1
+        if i == 0:
+            skipped_out[pack + lane, 0] = 1 - marked
+        if marked == 0:
+            return
+        mass = real(0.0)
+        part = dof_part[i]
+        if part >= 0:
+            if excess_in[pack, part, lane] > real(0.0):
+                node = dof_node[i]
+                mass = body_mass_scale_in[pack, node_body[node], lane] * node_mass_in[pack, node, lane]
+        for side in range(3):
+            for c in range(3):
+                y_out[pack, 3 * (side * size + i) + c, lane] = wp.where(c == side, mass, real(0.0))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def mend_panel(
+        size: int,
+        # Symbolic
+        part_start: wp.array(dtype=wp.int32),
+        part_dof: wp.array(dtype=wp.int32),
+        position: wp.array(dtype=wp.int32),
+        column: wp.array(dtype=wp.vec4i),
+        # Workspace in
+        excess_in: wp.array3d(dtype=real),
+        root_in: wp.array3d(dtype=real),
+        y_in: wp.array3d(dtype=real),
+        # Workspace out
+        a_out: wp.array3d(dtype=real),
+        lower_out: wp.array2d(dtype=real),
+    ):
+        """Last column of the inverse of a marked body's last panel, as another last pivot has it."""
+        pack, part, lane = wp.tid()
+        if excess_in[pack, part, lane] <= real(0.0):
+            return
+        w = pack + lane
+        root = part_dof[part_start[part + 1] - 1]
+        entry = column[position[root]]
+        wide = entry[2]
+        old = wp.transpose(block(lower_out, w, entry[3] + entry[1] * wide + entry[1], wide * wide))
+        back = wp.inverse(old)
+        inverse = inverse_root(back * side_block(y_in, pack, lane, size, root))
+        if inverse[0, 0] > real(0.0):
+            factor = wp.transpose(inverse * back)
+            for p in range(entry[1] + 1):
+                place = entry[3] + p * wide + entry[1]
+                store(lower_out, w, place, wide * wide, block(lower_out, w, place, wide * wide) * factor)
+        restore(a_out, root_in, pack, lane, part, root)
+
+    return SimpleNamespace(place_masses=place_masses, mend_panel=mend_panel)

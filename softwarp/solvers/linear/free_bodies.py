@@ -6,8 +6,9 @@ import numpy as np
 import warp as wp
 
 from softwarp.kernels.linear import free_bodies
+from softwarp.model import memory
 from softwarp.model.model import Model
-from softwarp.solvers.linear.cholesky import LinearSolver
+from softwarp.solvers.linear.cholesky import LinearSolver, PanelSolver
 from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
@@ -29,6 +30,8 @@ class FreeBodies:
         m = shard.model
         self.k = free_bodies.kernels(shard.variant)
         self.excess, self.root = shard.rows(self.count), shard.rows(3 * self.count)
+        self.share = shard.rows(2 * free_bodies.SHARES * self.count if shard.variant.world_fastest else 1)
+        self.skipped = memory.zeros((shard.world_count, 1), wp.int32, m.device)
         part = np.full(m.dof_count, -1)
         for number, dofs in enumerate(parts):
             part[dofs] = number
@@ -43,16 +46,34 @@ class FreeBodies:
         """Look which bodies need care; their last blocks get more, until ``mend``, so that a factor exists."""
         s, m, w = self.shard, self.shard.model, self.shard.work
         inputs = [self.part_start, self.part_dof, m.dof_node, m.node_body, w.body_mass.S, w.node_mass.S]
-        s.each(self.k.mark, self.count, inputs, [a.S, self.excess.S, self.root.S])
+        if s.variant.world_fastest:
+            s.each(self.k.gauge_shares, self.count * free_bodies.SHARES, [*inputs, a.S], [self.share.S])
+        s.each(self.k.mark, self.count, [*inputs, self.share.S], [a.S, self.excess.S, self.root.S])
 
     def mend(self, a: Rows) -> None:
         """Give marked bodies the last pivots that their masses call for; right-hand sides are overwritten."""
         s, m, w, linear = self.shard, self.shard.model, self.shard.work, self.linear
+        if linear.panels is not None:
+            self._mend_panels(linear.panels, a)
+            return
         i = linear.index
         inputs = [m.symbolic.size, self.part_start, self.part_dof, i["l_col"], i["row_start"], i["row_block"]]
         inputs += [m.dof_node, m.node_body, w.body_mass.real, w.node_mass.real]
         inputs += [self.excess.real, self.root.real, linear.lower.real]
         s.each_real(self.k.mend_root, self.count, inputs, [a.real, linear.y.real, linear.diagonal.real])
+
+    def _mend_panels(self, panels: PanelSolver, a: Rows) -> None:
+        s, m, w, y = self.shard, self.shard.model, self.shard.work, self.linear.y
+        k = free_bodies.panel_kernels(s.variant)
+        inputs = [m.symbolic.size, self.count, self.dof_part, m.dof_node, m.node_body]
+        inputs += [w.body_mass.real, w.node_mass.real, self.excess.real]
+        s.each_real(k.place_masses, m.dof_count, inputs, [self.skipped, y.real])
+        skipped, panels.skipped = panels.skipped, self.skipped
+        panels.forward(3)
+        panels.skipped = skipped
+        inputs = [m.symbolic.size, self.part_start, self.part_dof, panels.index["position"], panels.index["column"]]
+        inputs += [self.excess.real, self.root.real, y.real]
+        s.each_real(k.mend_panel, self.count, inputs, [a.real, panels.lower])
 
     def residual(self, a: Rows, b: Rows, u: Rows, y: Rows) -> None:
         """y = b - A u anew for the dofs of marked bodies."""
@@ -74,12 +95,17 @@ def free_parts(model: Model) -> list[np.ndarray]:
     others = (model.quadratic, model.hexes, model.membranes, model.reduction, model.cavities, model.tractions)
     if not model.tet_count or any(other is not None for other in others):
         return []
-    node, parent = model.dof_node.numpy(), model.symbolic.parent
-    root = np.arange(parent.size)
-    for j in np.flatnonzero(parent >= 0)[::-1]:
-        root[j] = root[parent[j]]
+    node, root = model.dof_node.numpy(), roots(model.symbolic.parent)
     is_held = (node >= model.own_node_count) | ~model.dof_free.numpy().reshape(-1, 3).all(axis=1)
     body, own = model.node_body.numpy(), model.node_dof.numpy()[: model.own_node_count]
     soft = ~is_held
     is_held[soft] |= np.isin(body[node[soft]], body[: own.size][own < 0])
     return [np.flatnonzero(root == j) for j in np.setdiff1d(root, root[is_held])]
+
+
+def roots(parent: np.ndarray) -> np.ndarray:
+    """Last dof of the elimination tree of every dof, from the next one above it, -1 where there is none."""
+    root = np.arange(parent.size)
+    for j in np.flatnonzero(parent >= 0)[::-1]:
+        root[j] = root[parent[j]]
+    return root

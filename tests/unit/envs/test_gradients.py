@@ -196,3 +196,33 @@ def test_gradients_that_are_not_unique_are_told(monkeypatch: pytest.MonkeyPatch)
     assert not found[:, 1].any()
     steps.begin()
     assert not steps.unsure.any()
+
+
+def test_steps_that_were_held_back_are_told() -> None:
+    """A world with elements inside out whose step is bounded has gradient 0 and is named; the other keeps every bit."""
+    env = sw.make("Trunk", num_worlds=2, seed=0, mesh="coarse")
+    env.reset()
+    steps = EnvSteps(env)
+    start = env.snapshot()
+    actions = torch.full((2, env.action_size), 0.2)
+
+    def gradient() -> torch.Tensor:
+        steps.begin()
+        given = actions.clone().requires_grad_()
+        steps.step(given)
+        steps.now["node_x"].square().sum().backward()
+        assert given.grad is not None
+        return given.grad
+
+    sure = gradient()
+    assert not steps.unsure.any()
+    env.restore(start)
+    x = env.sim.node_x[1]
+    x[int((x - x.mean(dim=0)).norm(dim=1).argmin()), 0] += 0.025
+    with pytest.warns(UserWarning, match="in world 1 and 0 others a step was held back"):
+        found = gradient()
+    assert int(env.sim.status[1]) < sw.Status.NONFINITE
+    assert steps.unsure.tolist() == [False, True]
+    assert sure.any(dim=1).all()
+    assert torch.equal(found[0], sure[0])
+    assert not found[1].any()

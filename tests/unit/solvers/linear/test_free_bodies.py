@@ -5,32 +5,42 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 import softwarp as sw
 from softwarp import meshing
+from softwarp.kernels.algebra import lanes
+from softwarp.kernels.linear import free_bodies
+from softwarp.solvers.linear.cholesky import PanelSolver
 from softwarp.solvers.linear.free_bodies import free_parts
 from softwarp.solvers.system import System
+from softwarp.solvers.workspace import rows
 
 WAYS = [
-    pytest.param("auto", 1, id="wide"),
-    pytest.param("auto", 9, id="lanes"),
-    pytest.param("scalar", 2, id="scalar"),
+    pytest.param("auto", 1, False, id="wide"),
+    pytest.param("auto", 9, False, id="lanes"),
+    pytest.param("scalar", 2, False, id="scalar"),
+    pytest.param("scalar", 2, True, id="panels"),
 ]
+CUDA = [pytest.param(path, 5, False, id=f"cuda-{path}", marks=pytest.mark.cuda) for path in ("panels", "levels")]
 
 
-def cube(worlds: int = 1, path: str = "auto", *, held: bool = False) -> sw.Simulation:
+def cube(worlds: int = 1, path: str = "auto", device: str = "cpu", *, held: bool = False) -> sw.Simulation:
     """A light silicone cube of 0.1 m and 1 g that falls; its elements are 10^3 times as stiff as it weighs."""
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, -9.81))
     mesh = meshing.box((0.1, 0.1, 0.1), (4, 4, 4))
     body = builder.add_tets(mesh, material=sw.Corotational(1.0e5, 0.4, method="large"), density=1.0)
     if held:
         builder.fix(body, box=((-1.0, -1.0, -1.0), (1.0, 1.0, 1e-9)))
-    return sw.Simulation(builder.finalize(worlds, "cpu", "float32"), 0.01, threads=1, solver_path=path)
+    return sw.Simulation(builder.finalize(worlds, device, "float32"), 0.01, threads=1, solver_path=path)
 
 
-def crushed(worlds: int, path: str) -> sw.Simulation:
+def crushed(worlds: int, path: str, *, panels: bool = False, device: str = "cpu") -> sw.Simulation:
     """Cubes after a step; in the last one a corner went through its neighbours, with elements 2000 times stiffer."""
-    sim = cube(worlds, path)
+    sim = cube(worlds, path, device)
+    linear = sim._systems[0].linear
+    if panels:
+        linear.panels = PanelSolver(linear.symbolic, linear.variant, worlds, 3, linear.y, "cpu")
     middle = int(np.linalg.norm(sim.model.node_rest - 0.05, axis=1).argmin())
     sim.node_x[worlds - 1, middle, 0] += 0.04
     sim.step()
@@ -59,10 +69,11 @@ def exact_matrix(system: System, world: int) -> tuple[np.ndarray, np.ndarray]:
     return A.reshape(3 * symbolic.size, -1), mass
 
 
-@pytest.mark.parametrize(("path", "worlds"), WAYS)
-def test_solution_of_a_crushed_body(path: str, worlds: int) -> None:
+@pytest.mark.parametrize(("path", "worlds", "panels"), [*WAYS, *CUDA])
+def test_solution_of_a_crushed_body(path: str, worlds: int, panels: bool, request: pytest.FixtureRequest) -> None:
     """A u = b with one correction, against dense float64, for pushes that move and pairs that squeeze the cube."""
-    sim, world = crushed(worlds, path), worlds - 1
+    device = "cuda:0" if "cuda" in request.node.callspec.id else "cpu"
+    sim, world = crushed(worlds, path, panels=panels, device=device), worlds - 1
     system = sim._systems[0]
     assert system.free is not None
     A, mass = exact_matrix(system, world)
@@ -82,13 +93,16 @@ def test_solution_of_a_crushed_body(path: str, worlds: int) -> None:
         assert np.abs(moved - expected).max() < 1e-3 * np.abs(exact).max()
 
 
-@pytest.mark.parametrize(("path", "worlds"), WAYS[1:])
-def test_other_worlds_keep_their_bits(path: str, worlds: int) -> None:
+@pytest.mark.parametrize(("path", "worlds", "panels"), WAYS[1:])
+def test_other_worlds_keep_their_bits(path: str, worlds: int, panels: bool) -> None:
     """Nothing happens to a world without crushed elements, whatever others of its pack do."""
     ends = []
     for cared in (False, True):
         sim = cube(worlds, path)
         system = sim._systems[0]
+        if panels:
+            linear = system.linear
+            linear.panels = PanelSolver(linear.symbolic, linear.variant, worlds, 3, linear.y, "cpu")
         if not cared:
             system.free = None
         sim.node_x[worlds - 1, 62, 0] += 0.04
@@ -99,10 +113,10 @@ def test_other_worlds_keep_their_bits(path: str, worlds: int) -> None:
     assert torch.equal(ends[0][:-1], ends[1][:-1]) and not torch.equal(ends[0][-1], ends[1][-1])
 
 
-@pytest.mark.parametrize(("path", "worlds"), WAYS)
-def test_matrix_stays(path: str, worlds: int) -> None:
+@pytest.mark.parametrize(("path", "worlds", "panels"), WAYS)
+def test_matrix_stays(path: str, worlds: int, panels: bool) -> None:
     """What the last block is given for the time of the factorisation is taken back to the bit."""
-    system = crushed(worlds, path)._systems[0]
+    system = crushed(worlds, path, panels=panels)._systems[0]
     assert system.free is not None
     system.tangent()
     before = system.work.a.real.numpy().copy()
@@ -113,6 +127,41 @@ def test_matrix_stays(path: str, worlds: int) -> None:
     np.testing.assert_array_equal(system.work.a.real.numpy(), before)
     marked = system.free.excess.real.numpy().transpose(0, 2, 1).reshape(-1)[:worlds] > 0.0
     assert marked.tolist() == [world == worlds - 1 for world in range(worlds)]
+
+
+def test_shares_of_a_gpu() -> None:
+    """Threads that share the dofs of a body find what one thread finds, but for the order in which masses are summed.
+
+    A CPU runs the kernels of a GPU here, whose arrays have the world fastest.
+    """
+    system = crushed(3, "scalar")._systems[0]
+    free, m, w = system.free, system.model, system.work
+    assert free is not None
+    system.tangent()
+    a = w.a.real.numpy().copy()
+    free.mark(w.a)
+    chosen = lanes.variant("cuda", "float32")
+    k = free_bodies.kernels(chosen)
+
+    def send(values: np.ndarray) -> rows.Rows:
+        sent = rows.allocate(chosen, 3, values.shape[1], "cpu")
+        sent.real.assign(values[:, :, 0].T[None])
+        return sent
+
+    def empty(count: int) -> rows.Rows:
+        return rows.allocate(chosen, 3, count, "cpu")
+
+    scale, mass, blocks = send(w.body_mass.real.numpy()), send(w.node_mass.real.numpy()), send(a)
+    share, excess, root = empty(2 * free_bodies.SHARES), empty(1), empty(3)
+    inputs = [free.part_start, free.part_dof, m.dof_node, m.node_body, scale.S, mass.S]
+    wp.launch(k.gauge_shares, (free_bodies.SHARES, 3), [*inputs, blocks.S], [share.S], device="cpu")
+    wp.launch(k.mark, (1, 3), [*inputs, share.S], [blocks.S, excess.S, root.S], device="cpu")
+    expected = free.excess.real.numpy()[:, :, 0].T
+    assert (expected > 0.0).tolist() == [[False, False, True]]
+    np.testing.assert_allclose(excess.real.numpy()[0], expected, rtol=1e-6)
+    np.testing.assert_array_equal(root.real.numpy()[0], free.root.real.numpy()[:, :, 0].T)
+    np.testing.assert_allclose(blocks.real.numpy()[0], w.a.real.numpy()[:, :, 0].T, rtol=1e-6)
+    np.testing.assert_array_equal(blocks.real.numpy()[0, :, :2], a[:2, :, 0].T)
 
 
 @pytest.mark.parametrize("world", [0, 4])
