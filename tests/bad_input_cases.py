@@ -166,22 +166,6 @@ def scene_calls() -> list[Call]:
             {"nodes": mesh, "material": sw.Corotational(1e5, 0.3), "total_mass": 1.0},
             words={"total_mass": ("mass",), "nodes": ("tets are missing",)},
         ),
-        Call(
-            "add_hexes",
-            method("add_hexes"),
-            {
-                "nodes": meshing.brick((0.1, 0.1, 0.1), (1, 1, 1)).nodes,
-                "hexes": meshing.brick((0.1, 0.1, 0.1), (1, 1, 1)).hexes,
-                "material": sw.Corotational(1e5, 0.3),
-                "density": 1e3,
-                "lumping": "volume",
-                "rayleigh": (0.0, 0.0),
-                "thin": False,
-                "name": "b",
-            },
-            {"name": {"none", "text"}, "thin": {"flag"}},
-            {"hexes": ("corners", "hexa"), "density": ("mass",), "name": ("name",)},
-        ),
         _rigid_call(method, unlimited),
         Call(
             "add_rod",

@@ -175,6 +175,9 @@ def _tied_calls(mesh: meshing.TetMesh) -> list[Call]:
     cable = {"waypoints": spring["points"], "stiffness": 1.0, "damping": 1.0}
     options = {"relaxation": (0.5, 0.1), "stiffness": np.ones(len(mesh.tets)), "contact_surface": mesh.nodes[:4]}
     lengths = {"rest_length": NONE, "tolerance": NONE}
+    brick = meshing.brick((0.1, 0.1, 0.1), (1, 1, 1))
+    hexes = {"nodes": brick.nodes, "hexes": brick.hexes, "material": law, "density": 1e3, "lumping": "volume"}
+    hexes |= {"rayleigh": (0.0, 0.0), "thin": False, "name": "b"}
     return [
         Call(
             "add_spring",
@@ -190,6 +193,13 @@ def _tied_calls(mesh: meshing.TetMesh) -> list[Call]:
             options,
             {"stiffness": NONE, "contact_surface": NONE},
             {"contact_surface": ("surface",)},
+        ),
+        Call(
+            "add_hexes",
+            lambda **given: sw.ModelBuilder().add_hexes(**given),
+            hexes,
+            {"name": {"none", "text"}, "thin": {"flag"}},
+            {"hexes": ("corners", "hexa"), "density": ("mass",), "name": ("name",)},
         ),
     ]
 

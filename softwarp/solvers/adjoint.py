@@ -241,8 +241,7 @@ class StepAdjoint:
     def to_start(self, *, parameters: bool) -> None:
         """Gradients by positions, velocities and so on at the start of the step, from p and q of a solution."""
         if self.contact is not None:
-            asked = parameters and self.rest is not None
-            self.contact.rest_bar = self.gradients.rest_x if asked else self.contact.no_rest
+            self.contact.take_rest(self.gradients.rest_x if parameters and self.rest is not None else None)
         self._to_elements(parameters=parameters)
         self._to_state()
         if self.frames is not None:
@@ -597,6 +596,5 @@ class StepAdjoint:
             self.tets.pull_rest(felt, self.stiffness, self.h, self.corner, rest)
         inputs = [s.lanes, m.corner_start, m.corner, rest.real]
         s.each_real(self.k.rest_nodes, m.node_count, inputs, [self.gradients.rest_x])
-        outputs = [self.gradients.cable_rest_length]
         inputs = [s.lanes, self.is_stage, self.measured.real, self.start.real]
-        s.each_real(self.k_rows.rest_lengths, m.cable_count, inputs, outputs)
+        s.each_real(self.k_rows.rest_lengths, m.cable_count, inputs, [self.gradients.cable_rest_length])

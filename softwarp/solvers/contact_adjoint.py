@@ -128,6 +128,10 @@ class ContactAdjoint:
         self.embedded.index_listed(node.numpy())
         self.listed = by_x, by_v
 
+    def take_rest(self, rest_bar: wp.array | None) -> None:
+        """Whether gradients by the rest positions of nodes that something carries are added, and to what."""
+        self.rest_bar = self.no_rest if rest_bar is None else rest_bar
+
     def begin(self, v: Rows, *, first: bool = True) -> None:
         """Sides of all contacts and their states.
 
