@@ -61,7 +61,7 @@ class FakeSimulation:
             surface_tri=surface.astype(np.int32),
             tri_body=np.zeros(len(surface), np.int32),
             tet_node=wp.array(tets, dtype=wp.int32, device="cpu"),
-            quadratic=None,
+            quadratic=None, hexes=None,
             node_rest=self.rest,
             node_fixed=self.rest[:, 2] < 1e-9,
             body_node_start=np.array([0, len(self.rest)]),
