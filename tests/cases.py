@@ -65,6 +65,21 @@ def quick(combinations: Iterable[tuple[Any, ...]], is_quick: Callable[..., bool]
     return [pytest.param(*values, marks=() if is_quick(*values) else pytest.mark.slow) for values in combinations]
 
 
+def in_float64(names: str, values: Iterable[Any], single: int = 0) -> pytest.MarkDecorator:
+    """Cases of a law in float64, whose tolerance is sharper, and one of them in float32 too; the others there are slow.
+
+    Args:
+        names: Of the values, as ``parametrize`` takes them; ``precision`` comes behind them.
+        values: Of each case.
+        single: Case that is quick in float32, too.
+    """
+    rows = [value if isinstance(value, tuple) else (value,) for value in values]
+    pairs = [(*row, precision) for row in rows for precision in ("float64", "float32")]
+    return pytest.mark.parametrize(
+        f"{names}, precision", quick(pairs, lambda *pair: pair[-1] == "float64" or pair[:-1] == rows[single])
+    )
+
+
 def lame(youngs: float, nu: float) -> tuple[float, float]:
     """Shear modulus and first Lame constant [Pa]."""
     return youngs / (2.0 * (1.0 + nu)), youngs * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))

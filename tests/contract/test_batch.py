@@ -5,6 +5,7 @@ modulus, gravity, damping and commands, stepped through large bending (catalogue
 """
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -125,16 +126,16 @@ def test_static_world_does_not_depend_on_its_batch(options: dict[str, Any], prec
         assert_same(reference, small, identity, list(range(len(identity))))
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("path", ["scalar", "lanes"])
-def test_threads_do_not_matter(threads: int, path: str) -> None:
+def test_threads_do_not_matter(path: str) -> None:
     """Worlds spread over other numbers of threads give the same bits."""
     identity = list(range(19))
-    sims = [build(19, {"solver_path": path, "threads": count}) for count in (1, threads)]
+    sims = [build(19, {"solver_path": path, "threads": count}) for count in (1, 2, 3)]
     for sim in sims:
         characterise(sim, identity)
         run(sim, identity, 20)
-    assert_same(state(sims[0]), state(sims[1]), identity, identity)
+    for sim in sims[1:]:
+        assert_same(state(sims[0]), state(sim), identity, identity)
 
 
 def test_run_to_run() -> None:
@@ -181,38 +182,49 @@ def poison(sim: sw.Simulation, world: int, kind: str) -> None:
         sim.control.node_force[world, 30] = 1e12
 
 
+@cache
+def at_work(options: tuple[tuple[str, Any], ...], precision: str, device: str) -> tuple[Any, ...]:
+    """64 individuals after 5 steps: simulation, what takes it back there, and what is seen after each of 5 more."""
+    everyone = list(range(64))
+    sim = build(64, dict(options), precision, device)
+    characterise(sim, everyone)
+    run(sim, everyone, 5)
+    start, given = sim.snapshot(), {name: value.clone() for name, value in sim.params.tensors().items()}
+    track = []
+    for step in range(5, 10):
+        run(sim, everyone, 1, start=step)
+        track.append(state(sim))
+    return sim, start, given, track
+
+
 @each_path
 @pytest.mark.parametrize("kind", [*NAN_POISONS, *ABSURD_POISONS])
 def test_poisoned_world_leaves_the_others_alone(
     kind: str, options: dict[str, Any], precision: str, device: str
 ) -> None:
     """NaN or an absurd command in one world: the other 63 keep their bits, the bad one is reported and stays finite."""
-    count, bad = 64, 21
-    everyone = list(range(count))
+    bad, everyone = 21, list(range(64))
     others = [i for i in everyone if i != bad]
-    clean, spoiled = (build(count, options, precision, device) for _ in range(2))
-    for sim in (clean, spoiled):
-        characterise(sim, everyone)
-        run(sim, everyone, 5)
-    for step in range(5, 10):
-        for sim in (clean, spoiled):
-            command(sim, everyone, step)
+    spoiled, start, given, track = at_work(tuple(options.items()), precision, device)
+    spoiled.restore(start)
+    for name, value in given.items():
+        spoiled.params.tensors()[name].copy_(value)
+    for step, clean in enumerate(track, start=5):
+        command(spoiled, everyone, step)
         if step == 6:
             poison(spoiled, bad, kind)
-        clean.step()
         spoiled.step()
+        seen = state(spoiled)
         if step == 6:
-            code = sw.Status(int(spoiled.status[bad]))
+            code = sw.Status(int(seen["status"][bad]))
             if kind in NAN_POISONS:
                 assert code == sw.Status.NONFINITE
             else:  # Newton's step control may refuse to follow instead
                 assert code != sw.Status.OK
                 assert code.failed or "newton_iterations" in options
-        assert bool((spoiled.status[others] == clean.status[others]).all())
-        seen = state(spoiled)
         for name in ("node_x", "node_v", "marker_x", "cable_length", "cable_tension", "cable_x"):
             assert bool(seen[name].isfinite().all()), f"{name} is not finite after step {step}"
-    assert_same(state(clean), state(spoiled), others, others)
+        assert_same(clean, seen, others, others)
 
 
 def test_failed_world_is_rolled_back() -> None:

@@ -7,16 +7,21 @@ import numpy as np
 import pytest
 
 import softwarp as sw
+from softwarp import meshing
 from tests import contact_cases as cases
-from tests.cases import quick
+from tests.cases import in_float64, quick
 from tests.contact_cases import G, array, contacts, pair, run
 
 both = pytest.mark.parametrize("precision", ["float64", "float32"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("precision", "worlds"), [("float64", 1), ("float32", 1), ("float32", 9)])
-@pytest.mark.parametrize("dt", [0.01, 0.002])
+@pytest.mark.parametrize(
+    ("precision", "worlds", "dt"),
+    quick(
+        [(*kind, dt) for kind in (("float64", 1), ("float32", 1), ("float32", 9)) for dt in (0.01, 0.002)],
+        lambda *case: case == ("float32", 1, 0.01),
+    ),
+)
 def test_stack_of_ten(precision: str, worlds: int, dt: float) -> None:
     """10 s: penetration < 1e-4 of the size, drift < 1e-3 of it, the floor carries 10 m g (7.8)."""
     size = 0.1
@@ -49,8 +54,7 @@ def test_stack_does_not_rock() -> None:
     assert fastest < 1.5e-3
 
 
-@both
-@pytest.mark.parametrize("count", [2, 3])
+@in_float64("count", [2, 3], single=1)
 def test_heavy_on_light(count: int, precision: str) -> None:
     """A cube of hundredfold mass on light ones: they stand, hardly penetrate and carry it (7.8)."""
     size = 0.1
@@ -86,7 +90,7 @@ def test_chair_on_four_legs(precision: str) -> None:
     ("lean", "mu", "precision"),
     quick(
         itertools.product((-0.6, 0.6, 1.0), (0.5, 1.4, 3.0), ("float64", "float32")),
-        lambda lean, mu, precision: precision == "float64" or mu == 1.4,
+        lambda lean, mu, precision: precision == "float64" or (lean, mu) == (0.6, 1.4),
     ),
 )
 def test_painleve_rod(lean: float, mu: float, precision: str) -> None:
@@ -167,3 +171,28 @@ def test_passive_pile_gains_no_energy(mu: float, seed: int, passes: int, precisi
         assert (pose[:, 2] > 0.0).all()
     assert rise < (1e-6 if passes == 0 and precision == "float64" else 2e-4) * first
     assert last < 0.3 * first
+
+
+@pytest.mark.slow
+def test_passive_pile_never_gains_energy() -> None:
+    """Boxes, balls, a rod and a soft cube fall on each other: the total energy only falls."""
+    builder = sw.ModelBuilder()
+    cube = cases.placed(meshing.box((0.1,) * 3, (2,) * 3), (-0.05, -0.05, 0.45))
+    floor = builder.add_rigid(sw.Plane(), kinematic=True)
+    parts = [builder.add_rigid(sw.Box((0.1, 0.08, 0.06)), mass=0.5, pose=(0.0, 0.0, 0.2))]
+    parts.append(builder.add_rigid(sw.Sphere(0.05), mass=0.5, pose=(0.03, 0.02, 0.35)))
+    parts.append(builder.add_tets(cube, material=sw.NeoHookean(5e4, 0.3), density=1000.0))
+    points = np.linspace((-0.2, 0.0, 0.65), (0.2, 0.0, 0.65), 9)
+    parts.append(builder.add_rod(points, radius=0.01, youngs=1e6, density=1000.0))
+    for i, part in enumerate(parts):
+        builder.add_contact(part, floor, mu=0.5)
+        for other in parts[:i]:
+            builder.add_contact(part, other, mu=0.5)
+    sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.002)
+    energy = start = sim.energy().item()
+    for _ in range(400):
+        sim.step()
+        assert sim.energy().item() <= energy + 1e-4 * start
+        energy = sim.energy().item()
+    assert energy < 0.5 * start
+    assert (sim.status == 0).all()
