@@ -30,7 +30,7 @@ class Bricks:
         rayleigh: tuple[float, float] = (0.0, 0.0),
         stiffness: ArrayLike | None = None,
         contact_surface: Any = None,
-        thin: bool = False,
+        thin: bool | ArrayLike = False,
         name: str | None = None,
     ) -> SoftBody:
         """Add a soft body of hexahedra with incompatible modes, which bend and do not lock near nu = 0.5.
@@ -53,7 +53,8 @@ class Bricks:
             stiffness: Factors of the modulus, positive, one an element, (m,).
             contact_surface: As for ``add_tets``.
             thin: Whether elements are the whole thickness of a wall, from its lower to its upper face: six more modes
-                then let them bend under moments that change along them, and coarser ones do.
+                then let them bend under moments that change along them, and coarser ones do. Where a body has walls and
+                solid parts, one flag an element, (m,).
             name: For messages and exports.
 
         Returns:

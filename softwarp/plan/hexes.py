@@ -41,7 +41,7 @@ def hex_layout(scene: Scene, node_start: IntArray) -> HexLayout:
             volumes = (volumes.sum() / len(spec.mesh.nodes) / counts)[hexes]
         lumped.append(volumes)
         factor.append(np.ones(len(hexes)) if spec.stiffness is None else spec.stiffness)
-        thin.append(np.full(len(hexes), spec.thin))
+        thin.append(np.zeros(len(hexes), dtype=bool) if spec.thin is None else spec.thin)
     return HexLayout(
         nodes=np.concatenate(nodes).astype(np.int32),
         body=np.repeat([i for i, _, _ in found], [len(part) for part in nodes[1:]]).astype(np.int32),
@@ -62,7 +62,7 @@ def hex_model(layout: HexLayout, nodes: FloatArray, found: Structure) -> HexMode
         return None
     x = own_corners(nodes[layout.nodes])
     grid = SAME * np.abs(x).max()
-    keys = np.column_stack([layout.body, np.round(x.reshape(len(x), -1) / grid)])
+    keys = np.column_stack([layout.body, layout.thin, np.round(x.reshape(len(x), -1) / grid)])
     _, first, shape = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     pieces = split(layout.nodes)
     return HexModel(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks, meshing
 from softwarp.meshing import MeshError
@@ -76,7 +76,7 @@ def add_hexes(
     stiffness: ArrayLike | None = None,
     name: str | None,
     contact_surface: Any = None,
-    thin: bool = False,
+    thin: bool | ArrayLike = False,
 ) -> SoftBody:
     """Add a soft body of hexahedra with incompatible modes."""
     label = scene.new_name(name, f"body{len(scene.bodies)}")
@@ -101,7 +101,7 @@ def add_hexes(
     given: dict[str, Any] = {
         "mesh": nodes.linear(),
         "hexes": nodes.hexes,
-        "thin": checks.flag(thin, f"body {label!r}: thin"),
+        "thin": _walls(thin, len(nodes.hexes), label),
         "material": material,
         "density": value,
         "lumping": lumping,
@@ -163,6 +163,15 @@ def _stiffness(value: ArrayLike, count: int, label: str, *, points: bool = False
         value, f"body {label!r}: stiffness", *shapes, above=0.0, need=f"be positive and finite, of shape {told}"
     )
     return np.repeat(found[:, None], POINTS, axis=1) if points and found.ndim == 1 else found
+
+
+def _walls(value: bool | ArrayLike, count: int, label: str) -> NDArray[np.bool_]:
+    """Which hexahedra have the modes of walls, (hex,)."""
+    found = checks.as_array(value)
+    if found.dtype.kind != "b" or found.shape not in ((), (count,)):
+        need = f"be True, False, or one of the two for each hexahedron, of shape ({count},)"
+        raise ValueError(checks.refusal(f"body {label!r}: thin", need, value))
+    return np.full(count, found)
 
 
 def _contact_surface(value: Any, mesh: meshing.TetMesh, label: str) -> ContactSurface:

@@ -70,7 +70,7 @@ class BodySpec:
     load: FloatArray  # (n, 3) [N]
     elements: IntArray | None = None  # (m, 10) quadratic ones; the mesh then has the linear tets between their nodes
     hexes: IntArray | None = None  # (m, 8) hexahedra; the mesh then has the linear tets between their nodes
-    thin: bool = False  # hexahedra with the modes of walls
+    thin: NDArray[np.bool_] | None = None  # (m,) which hexahedra have the modes of walls; None where there are none
     contact_surface: ContactSurface | None = None  # what touches; None for the boundary of the mesh
     stiffness: FloatArray | None = None  # factors of the modulus, (m,) of elements, (m, 4) of quadratic ones' points
     reduction: ReductionSpec | None = None  # modes that it moves in; None for node by node

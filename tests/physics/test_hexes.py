@@ -368,8 +368,9 @@ def test_hexes_say_what_they_do_not_know() -> None:
         builder.add_hexes(mesh.nodes, material=sw.Corotational(1e5, 0.4), density=1000.0)
     with pytest.raises(ValueError, match="hexes are given twice"):
         builder.add_hexes(mesh, mesh.hexes, material=sw.Corotational(1e5, 0.4), density=1000.0)
-    with pytest.raises(ValueError, match="thin must be True or False, got 'yes'"):
-        builder.add_hexes(mesh, material=sw.Corotational(1e5, 0.4), density=1000.0, thin="yes")  # type: ignore[arg-type]
+    for thin in ("yes", [True], np.ones(len(mesh.hexes))):
+        with pytest.raises(ValueError, match=r"thin must be True, False, or one of the two for each .* shape \(\d+,\)"):
+            builder.add_hexes(mesh, material=sw.Corotational(1e5, 0.4), density=1000.0, thin=thin)
     sim = block(mesh, held=[0, 1, 2])
     with pytest.raises(ValueError, match="hexahedra, those of body 'body0', have no gradient yet"):
         sw.gradients.Rollout(sim)

@@ -1,5 +1,7 @@
 """Hexahedra with the modes of walls: fields, bending, and plain ones beside them. Theory: docs/theory/hexahedral.md."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,7 @@ def test_stretches_are_exact(nu: float, rng: np.random.Generator) -> None:
     np.testing.assert_allclose(found.reshape(8, 3), wanted, atol=1e-12)
 
 
-def sag(cells: int, nu: float, *, thin: bool) -> float:
+def sag(cells: int, nu: float, *, thin: Any) -> float:
     """Of the end of a strip that is clamped at the other one [m]; its force is shared by the end's nodes."""
     mesh = meshing.brick((LENGTH, WIDTH, THICK), (cells, 1, 1))
     builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
@@ -60,6 +62,14 @@ def test_one_wall_bends_under_a_force_as_a_beam_does(cells: int) -> None:
     sheared = FORCE * LENGTH / (5.0 / 6.0 * 0.5 * YOUNGS * WIDTH * THICK)
     assert sag(cells, 0.0, thin=True) == pytest.approx(bent + sheared, rel=3e-3)
     assert sag(cells, 0.0, thin=False) == pytest.approx(bent * (1.0 - 0.25 / cells**2), rel=5e-3)
+
+
+def test_walls_stand_beside_solid_parts() -> None:
+    """One flag an element: as the force is the same along a strip, each of two equal bricks brings half of the way."""
+    assert sag(2, 0.0, thin=np.array([True, True])) == sag(2, 0.0, thin=True)
+    plain, first, last, walls = (sag(2, 0.0, thin=np.isin([0, 1], kinds)) for kinds in ([], [0], [1], [0, 1]))
+    assert plain == sag(2, 0.0, thin=False)
+    assert [first - plain, last - plain] == pytest.approx([0.5 * (walls - plain)] * 2, rel=1e-3)
 
 
 def test_walls_lock_less() -> None:
