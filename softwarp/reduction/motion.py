@@ -17,6 +17,7 @@ from softwarp.simulation import Simulation
 
 FloatArray = NDArray[np.float64]
 Drive = Callable[[Simulation, int], None]
+TOGETHER = 2_000_000  # distances that are looked at together
 
 
 @dataclass(frozen=True)
@@ -148,12 +149,17 @@ def _touch(sim: Simulation) -> torch.Tensor:
             if part.kind != "soft body" or world.numel() == 0:
                 continue
             first, end = int(start[int(part)]), int(start[int(part) + 1])
-            point, load = sim.contact_point[world, place], sign * sim.contact_load[world, place]
-            for w in world.unique():
-                own = world == w
-                near = torch.cdist(point[own], sim.node_x[w, first:end]).argmin(dim=1)
-                found[w].index_add_(0, first + near, load[own].to(found))
+            near = _nearest(sim.node_x[:, first:end], world, sim.contact_point[world, place])
+            load = sign * sim.contact_load[world, place].to(found)
+            found.index_put_((world, first + near), load, accumulate=True)
     return found
+
+
+def _nearest(nodes: torch.Tensor, world: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """Numbers of the nodes, (world, node, 3), next to points that lie in some worlds, (point,)."""
+    together = max(TOGETHER // max(nodes.shape[1], 1), 1)
+    parts = zip(world.split(together), points.to(nodes).split(together), strict=True)
+    return torch.cat([(nodes[w] - p[:, None]).square().sum(dim=2).argmin(dim=1) for w, p in parts])
 
 
 def record(sim: Simulation, drive: Drive, steps: int, *, every: int = 10) -> Motion:

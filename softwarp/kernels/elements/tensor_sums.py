@@ -1,14 +1,14 @@
 """Stiffness of reduced bodies in modes on a GPU's tensor cores: the sums of ``samples`` in one kernel, K E kept near.
 
 A block of threads has two worlds, two warps for each. It takes eight samples at a time, and two rows of each in a
-round. Their K E lie in shared memory; the two warps of a world share the tiles, 16 x 8 modes, of the lower triangle of
-the ``E' (K E)`` that they add up in registers. Tensor cores take factors of 11 bits. Each number is therefore the sum
-of two of float16, a = a1 + a2, and a b is a2 b1 + a1 b2 + a1 b1, so that what is left out is about what a product of
-float32 rounds. E is split ahead of time (``fragments``), in the order in which threads of a warp hold it; K E once by
-the thread that finds it. Powers of two bring both to where float16 has its range: one for E, and for K E of a world one
-for every round, from the largest entry of K in it. Tensor cores also round sums towards zero; so they only add up
-sixteen terms, and what comes of it is added as other numbers are. The order of sums is fixed and the same for
-every world. Theory: docs/theory/reduction.md.
+round. K E of some rounds lie in shared memory; the two warps of a world share the tiles, 16 x 8 modes, of the lower
+triangle of the ``E' (K E)`` that they add up in registers. Tensor cores take factors of 11 bits. Each number is
+therefore the sum of two of float16, a = a1 + a2, and a b is a2 b1 + a1 b2 + a1 b1, so that what is left out is about
+what a product of float32 rounds. E is split ahead of time (``fragments``), in the order in which threads of a warp hold
+it; K E once by the thread that finds it. Powers of two bring both to where float16 has its range: one for E, and for
+K E of a world one for every eight samples, from the largest entry of K in them. Tensor cores also round sums towards
+zero; so they only add up sixteen terms, and what comes of it is added as other numbers are. The order of sums is fixed
+and the same for every world. Theory: docs/theory/reduction.md.
 """
 
 import re
@@ -31,99 +31,120 @@ OLDEST = 80  # compute capability from which tensor cores take numbers of float3
 BLOCKS = 2  # at once on a multiprocessor, which bounds the registers of a thread
 TOP = 14  # binary logarithm of the bound that factors of float16 are brought to
 TOGETHER = 8  # samples in a round
+CHUNK = 2  # rounds whose K E lie in shared memory
 
-# Samples of one kind, SIZE rows of E each. Rounds have two places for K, its largest entries and K E, so that warps
-# meet once in each. K of a sample lies column by column, two rows of both worlds beside each other.
+# Samples of one kind, SIZE rows of E each, in PAIRS rounds. K of eight samples lies pair by pair of its rows, those of
+# both worlds beside each other. What a thread takes of E serves CHUNK rounds; warps then meet, and again behind their
+# products. K of the next samples comes meanwhile.
 _ADD = """
 {
-const int most = COUNT, rounds = (SIZE + 1) / 2, total = (most + 7) / 8 * rounds;
-const float* e = BASIS.data + E_FIRST;
-const uint4* halves = (const uint4*)HALVES.data;
+const int most = COUNT, stages = (most + 7) / 8, t = thread >> 4, c = 2 * (thread & 15);
+const float* e = BASIS.data + E_FIRST + c;
+const uint4* halves = (const uint4*)HALVES.data + (thread & 31);
 const long long across = STIFFNESS.strides[1] / sizeof(float);
 const float* k = &wp::index(STIFFNESS, group * 2 + (group * 2 + (thread & 1) < worlds ? (thread & 1) : 0), K_FIRST);
-float held[SIZE / 4 + 1];
-auto fetch = [&](int turn) {
-    const int sample = turn / rounds * 8, round = turn % rounds;
+float held[PAIRS * SIZE / 4 + 1];
+float2 own[SIZE][PIECES];
+auto fetch = [&](int sample) {
     #pragma unroll
-    for (int p = 0; p < SIZE / 4 + 1; ++p) {
-        const int q = (128 * p + thread) >> 1, t = q / (2 * SIZE), at = q % (2 * SIZE);
-        held[p] = q < 16 * SIZE && sample + t < most && 2 * round + at / SIZE < SIZE
-            ? k[((long long)(sample + t) * (SIZE * SIZE) + 2 * SIZE * round + at) * across] : 0.0f;
+    for (int p = 0; p < PAIRS * SIZE / 4 + 1; ++p) {
+        const int q = (128 * p + thread) >> 1, s = q / (2 * PAIRS * SIZE), at = q % (2 * PAIRS * SIZE);
+        held[p] = q < 16 * PAIRS * SIZE && sample + s < most && at < SIZE * SIZE
+            ? k[((long long)(sample + s) * (SIZE * SIZE) + at) * across] : 0.0f;
     }
 };
-auto keep = [&](int place) {
+auto keep = [&]() {
     unsigned largest = 0;
     #pragma unroll
-    for (int p = 0; p < SIZE / 4 + 1; ++p) {
-        const int q = (128 * p + thread) >> 1, t = q / (2 * SIZE), at = q % (2 * SIZE);
-        if (q < 16 * SIZE) near_k[place][4 * (t * SIZE + at % SIZE) + 2 * (thread & 1) + at / SIZE] = held[p];
+    for (int p = 0; p < PAIRS * SIZE / 4 + 1; ++p) {
+        const int q = (128 * p + thread) >> 1, s = q / (2 * PAIRS * SIZE), at = q % (2 * PAIRS * SIZE);
+        const int row = at / SIZE;
+        if (q < 16 * PAIRS * SIZE)
+            near_k[4 * ((s * PAIRS + row / 2) * SIZE + at % SIZE) + 2 * (thread & 1) + (row & 1)] = held[p];
         largest = max(largest, __float_as_uint(held[p]) & 0x7fffffffu);
     }
     #pragma unroll
     for (int far = 2; far < 32; far *= 2) largest = max(largest, __shfl_xor_sync(0xffffffffu, largest, far));
-    if ((thread & 31) < 2) near_most[place][4 * (thread & 1) + (thread >> 5)] = largest;
+    if ((thread & 31) < 2) near_most[4 * (thread & 1) + (thread >> 5)] = largest;
 };
-auto exponent = [&](int place, int world) {
+auto exponent = [&](int world) {
     unsigned largest = 0;
     #pragma unroll
-    for (int q = 0; q < 4; ++q) largest = max(largest, near_most[place][4 * world + q]);
+    for (int q = 0; q < 4; ++q) largest = max(largest, near_most[4 * world + q]);
     return max((int)(__float_as_uint(__uint_as_float(largest) * (SIZE * MOST)) >> 23) & 255, 20);
 };
+auto rows = [&](int sample) {
+    const float* mine = e + (long long)(sample + t < most ? sample + t : 0) * (SIZE * MODES);
+    #pragma unroll
+    for (int a = 0; a < SIZE; ++a)
+        #pragma unroll
+        for (int p = 0; p < PIECES; ++p)
+            if (c + 32 * p < MODES) own[a][p] = *(const float2*)&mine[a * MODES + 32 * p];
+};
 __syncthreads();
-if (total > 0) {
+if (stages > 0) {
     fetch(0);
-    keep(0);
-    fetch(1);
+    keep();
+    fetch(8);
 }
 __syncthreads();
-for (int turn = 0; turn < total; ++turn) {
-    const int sample = turn / rounds * 8, place = turn & 1, t = thread >> 4, c = 2 * (thread & 15);
-    const float back = __uint_as_float((unsigned)(exponent(place, thread >> 6) + 1 - TOP) << 23) * BACK;
-    {
-        const float* mine = e + (long long)(sample + t < most ? sample + t : 0) * (SIZE * MODES) + c;
-        float2 s[4][PIECES];
+for (int stage = 0; stage < stages; ++stage) {
+    const int mine = exponent(thread >> 6);
+    const float back = __uint_as_float((unsigned)(mine + 1 - TOP) << 23) * BACK;
+    const float scales[2] = {__uint_as_float((unsigned)(253 + TOP - exponent(0)) << 23),
+                             __uint_as_float((unsigned)(253 + TOP - exponent(1)) << 23)};
+    #pragma unroll
+    for (int part = 0; part < PAIRS; part += CHUNK) {
+        rows(8 * stage);
         #pragma unroll
-        for (int i = 0; i < 4; ++i)
+        for (int r = part; r < (part + CHUNK < PAIRS ? part + CHUNK : PAIRS); ++r) {
+            float2 sum[4][PIECES];
             #pragma unroll
-            for (int p = 0; p < PIECES; ++p) s[i][p] = make_float2(0.0f, 0.0f);
-        #pragma unroll
-        for (int a = 0; a < SIZE; ++a) {
-            const float4 g = *(const float4*)&near_k[place][4 * (t * SIZE + a)];
+            for (int i = 0; i < 4; ++i)
+                #pragma unroll
+                for (int p = 0; p < PIECES; ++p) sum[i][p] = make_float2(0.0f, 0.0f);
             #pragma unroll
-            for (int p = 0; p < PIECES; ++p)
-                if (c + 32 * p < MODES) {
-                    const float2 x = *(const float2*)&mine[a * MODES + 32 * p];
-                    s[0][p].x += g.x * x.x, s[0][p].y += g.x * x.y;
-                    s[1][p].x += g.y * x.x, s[1][p].y += g.y * x.y;
-                    s[2][p].x += g.z * x.x, s[2][p].y += g.z * x.y;
-                    s[3][p].x += g.w * x.x, s[3][p].y += g.w * x.y;
+            for (int a = 0; a < SIZE; ++a) {
+                const float4 g = *(const float4*)&near_k[4 * ((t * PAIRS + r) * SIZE + a)];
+                #pragma unroll
+                for (int p = 0; p < PIECES; ++p) {
+                    sum[0][p].x += g.x * own[a][p].x, sum[0][p].y += g.x * own[a][p].y;
+                    sum[1][p].x += g.y * own[a][p].x, sum[1][p].y += g.y * own[a][p].y;
+                    sum[2][p].x += g.z * own[a][p].x, sum[2][p].y += g.z * own[a][p].y;
+                    sum[3][p].x += g.w * own[a][p].x, sum[3][p].y += g.w * own[a][p].y;
                 }
-        }
-        #pragma unroll
-        for (int world = 0; world < 2; ++world) {
-            const float scale = __uint_as_float((unsigned)(253 + TOP - exponent(place, world)) << 23);
+            }
             #pragma unroll
-            for (int p = 0; p < PIECES; ++p)
-                if (c + 32 * p < MODES) {
-                    uint2 head, tail;
-                    split(s[2 * world][p].x * scale, s[2 * world + 1][p].x * scale, head.x, tail.x);
-                    split(s[2 * world][p].y * scale, s[2 * world + 1][p].y * scale, head.y, tail.y);
-                    *(uint2*)&near_y[place][world][t][c + 32 * p] = head;
-                    *(uint2*)&near_y[place][world][8 + t][c + 32 * p] = tail;
-                }
+            for (int world = 0; world < 2; ++world)
+                #pragma unroll
+                for (int p = 0; p < PIECES; ++p)
+                    if (c + 32 * p < MODES) {
+                        const float scale = scales[world];
+                        uint2 head, tail;
+                        split(sum[2 * world][p].x * scale, sum[2 * world + 1][p].x * scale, head.x, tail.x);
+                        split(sum[2 * world][p].y * scale, sum[2 * world + 1][p].y * scale, head.y, tail.y);
+                        *(uint2*)&near_y[r - part][world][t][c + 32 * p] = head;
+                        *(uint2*)&near_y[r - part][world][8 + t][c + 32 * p] = tail;
+                    }
         }
-    }
-    keep(place ^ 1);
-    __syncthreads();
-    if (turn + 2 < total) fetch(turn + 2);
-    const uint4* x = halves + (long long)turn * (64 * ROWS) + (thread & 31);
-    const unsigned* y = &near_y[place][thread >> 6][lane][high];
-    uint4 a1[OWN], a2[OWN];
-    unsigned b1[2], b2[2];
-    if (side == 0) {
-        MULTIPLY_0
-    } else {
-        MULTIPLY_1
+        __syncthreads();
+        if (part + CHUNK >= PAIRS) {
+            keep();
+            fetch(8 * stage + 16);
+        }
+        #pragma unroll 1
+        for (int r = part; r < (part + CHUNK < PAIRS ? part + CHUNK : PAIRS); ++r) {
+            const uint4* x = halves + (long long)(stage * PAIRS + r) * (64 * ROWS);
+            const unsigned* y = &near_y[r - part][thread >> 6][lane][high];
+            uint4 a1[OWN], a2[OWN];
+            unsigned b1[2], b2[2];
+            if (side == 0) {
+                MULTIPLY_0
+            } else {
+                MULTIPLY_1
+            }
+        }
+        __syncthreads();
     }
 }
 }
@@ -149,9 +170,9 @@ _ALL = """
 const int worlds = sum_out.shape[0];
 #if defined(__CUDA_ARCH__)
 #if __CUDA_ARCH__ >= 800
-__shared__ __align__(16) unsigned near_y[2][2][16][WIDE];
-__shared__ __align__(16) float near_k[2][288];
-__shared__ unsigned near_most[2][8];
+__shared__ __align__(16) unsigned near_y[CHUNK][2][16][WIDE];
+__shared__ __align__(16) float near_k[1440];
+__shared__ unsigned near_most[8];
 const int high = (thread & 31) >> 2, lane = thread & 3, side = (thread >> 5) & 1;
 auto split = [](float low, float up, unsigned& head, unsigned& tail) {
     float a, b;
@@ -240,15 +261,20 @@ def _source(modes: int) -> str:
     """Native code for bodies with a stride of some modes."""
     both = _shared_out(modes // 16)
     parts = {f"MULTIPLY_{side}": _multiply(rows) for side, rows in enumerate(both)}
-    add = _filled(_ADD, **parts)
+    add = _ADD.replace("PAIRS", "((SIZE + 1) / 2)")
+    add = _filled(add, **parts)
     tets = _filled(add, COUNT="tet_count", BASIS="tet_basis", E_FIRST="tet_at", STIFFNESS="stiffness_in")
-    tets = _filled(tets, HALVES="tet_halves", K_FIRST="tet_first", MOST="tet_most", BACK="tet_back", SIZE=TET)
+    tets = _filled(
+        tets, HALVES="tet_halves", K_FIRST="tet_first", MOST="tet_most", BACK="tet_back", SIZE=TET, PAIRS=-(-TET // 2)
+    )
     tris = _filled(add, COUNT="tri_count", BASIS="tri_basis", E_FIRST="tri_at", STIFFNESS="thin_in")
-    tris = _filled(tris, HALVES="tri_halves", K_FIRST="tri_first", MOST="tri_most", BACK="tri_back", SIZE=TRI)
+    tris = _filled(
+        tris, HALVES="tri_halves", K_FIRST="tri_first", MOST="tri_most", BACK="tri_back", SIZE=TRI, PAIRS=-(-TRI // 2)
+    )
     text = _filled(_ALL, ADD_TETS=tets, ADD_TRIS=tris, WRITE_0=_write(both[0]), WRITE_1=_write(both[1]))
     pieces = -(-modes // 32)
     text = _filled(text, WIDE=32 * pieces + 8, PIECES=pieces, MODES=modes, TOP=TOP, ROWS=modes // 16)
-    return _filled(text, OWN=max(map(len, both)), TILES=modes // 8)
+    return _filled(text, OWN=max(map(len, both)), TILES=modes // 8, CHUNK=CHUNK)
 
 
 @dataclass(frozen=True)

@@ -57,14 +57,15 @@ const int own = first + thread / 32, lane = thread % 32;
 SCALAR sum[EACH][OTHERS][9] = {};
 for (int q = 0; q < size; q += DOFS) {
     const int dofs = size - q < DOFS ? size - q : DOFS;
-    for (int e = thread; e < end * 9 * DOFS; e += THREADS) {
-        const int c = e / (9 * DOFS), at = e % (9 * DOFS), d = at / 9;
-        SCALAR value = 0;
-        if (d < dofs) {
-            const int k = places[c * size + wp::index(column, q + d)[0]];
-            if (k >= 0) value = sides[9 * (c * path_limit + k) + at - 9 * d];
-        }
-        near[c * STRIDE + at] = value;
+    const int own_dof = thread % DOFS;
+    const int row = own_dof < dofs ? wp::index(column, q + own_dof)[0] : 0;
+    #pragma unroll 2
+    for (int c = thread / DOFS; c < end; c += THREADS / DOFS) {
+        const int k = own_dof < dofs ? places[c * size + row] : -1;
+        const SCALAR* const from = sides + 9 * (c * path_limit + (k < 0 ? 0 : k));
+        SCALAR* const to = near + c * STRIDE + 9 * own_dof;
+        #pragma unroll
+        for (int i = 0; i < 9; ++i) to[i] = k < 0 ? (SCALAR)0 : from[i];
     }
     MEET
     for (int d = 0; d < dofs; ++d)

@@ -39,30 +39,53 @@ static SCALAR slot;
 const int COLUMNS = MOST / 32 + 1;
 SCALAR* const a = (SCALAR*)system;
 const int parts = unknowns / 32 + 1;
-SCALAR top[COLUMNS];
-for (int k = 0; k < unknowns; ++k) {
+SCALAR top[COLUMNS], next[COLUMNS];
+for (int k = 0; k < unknowns; k += 2) {
     SCALAR* const pivots = a + k * stride;
+    SCALAR* const others = pivots + stride;
+    const bool is_pair = k + 1 < unknowns;
     const SCALAR pivot = pivots[k], least = pivots[unknowns + 1];
     const SCALAR inverse = (pivot < 0 ? -pivot : pivot) > least ? (SCALAR)1 / pivot : (SCALAR)0;
+    const SCALAR beside = is_pair ? pivots[k + 1] * inverse : (SCALAR)0;
+    const SCALAR below = is_pair ? others[k] : (SCALAR)0;
+    const SCALAR second = is_pair ? others[k + 1] - below * beside : (SCALAR)0;
+    const SCALAR lesser = is_pair ? others[unknowns + 1] : (SCALAR)0;
+    const SCALAR reciprocal = (second < 0 ? -second : second) > lesser ? (SCALAR)1 / second : (SCALAR)0;
     for (int m = 0; m < COLUMNS; ++m) {
         const int c = thread + 32 * m;
-        top[m] = m < parts && c > k && c <= unknowns ? pivots[c] * inverse : (SCALAR)0;
+        const bool is_own = m < parts && c > k + 1 && c <= unknowns;
+        top[m] = is_own ? pivots[c] * inverse : (SCALAR)0;
+        next[m] = is_own && is_pair ? others[c] - below * top[m] : (SCALAR)0;
     }
-    for (int r = k + 1; r < unknowns; r += LINES) {
+    MEET
+    for (int m = 0; m < COLUMNS; ++m) {
+        const int c = thread + 32 * m;
+        if (m >= parts || c <= k + 1 || c > unknowns || !is_pair) continue;
+        others[c] = next[m];
+        next[m] *= reciprocal;
+    }
+    for (int r = k + 2; r < unknowns; r += LINES) {
         SCALAR* const line = a + r * stride;
         const int last = unknowns - r < LINES ? unknowns - r : LINES;
-        SCALAR factor[LINES];
-        for (int i = 0; i < LINES; ++i) factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
+        SCALAR factor[LINES], further[LINES];
+        for (int i = 0; i < LINES; ++i) {
+            factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
+            further[i] = i < last ? line[i * stride + k + 1] - factor[i] * beside : (SCALAR)0;
+        }
         for (int m = 0; m < COLUMNS; ++m) {
             const int c = thread + 32 * m;
-            if (m >= parts || c <= k || c > unknowns) continue;
+            if (m >= parts || c <= k + 1 || c > unknowns) continue;
             SCALAR entry[LINES];
             for (int i = 0; i < LINES; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
-            for (int i = 0; i < LINES; ++i) if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m];
+            for (int i = 0; i < LINES; ++i)
+                if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m] - further[i] * next[m];
         }
     }
     MEET
-    if (thread == 0) pivots[unknowns + 1] = inverse;
+    if (thread == 0) {
+        pivots[unknowns + 1] = inverse;
+        if (is_pair) others[unknowns + 1] = reciprocal;
+    }
 }
 MEET
 SCALAR x[COLUMNS], total = 0;
