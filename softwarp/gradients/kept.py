@@ -41,7 +41,7 @@ class KeptSolutions:
         self._device, self._workers = device, workers
         self._pulls = [(pull, list(pull.solution)) for pull in pulls]
         self._parts = [wp.to_torch(array, requires_grad=False) for _, arrays in self._pulls for array in arrays]
-        self.nbytes = sum(part.nbytes for part in self._parts)
+        self.nbytes: int = sum(part.nbytes for part in self._parts)
         is_long = [
             any(part.ptr == getattr(holder, name).real.ptr for holder, name in pull.long_parts)
             for pull, parts in self._pulls

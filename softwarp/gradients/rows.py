@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from softwarp.gradients.kept import KeptSolutions
 from softwarp.model.floating import RIGID, FloatingModel
 from softwarp.model.gradients import FRAMES, PARAMETERS, REST
 from softwarp.model.model import Model
@@ -33,6 +34,7 @@ class Worlds(Protocol):
     names: Sequence[str]
     state: Slopes
     gradients: Slopes
+    kept_solutions: KeptSolutions
 
     @property
     def solution_bytes(self) -> int:
@@ -51,19 +53,7 @@ class Worlds(Protocol):
         """Put these in place."""
         ...
 
-    def solutions(self, count: int) -> list[torch.Tensor]:
-        """Room for the solutions of some steps."""
-        ...
-
-    def keep_solution(self, room: list[torch.Tensor], place: int) -> None:
-        """Copy that of the last step."""
-        ...
-
-    def give_back(self, room: list[torch.Tensor]) -> None:
-        """Room that may be taken again."""
-        ...
-
-    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0, *, parameters: bool = True) -> None:
+    def pull(self, solution: Sequence[torch.Tensor] | None = None, *, parameters: bool = True) -> None:
         """Gradients by the end of a step become those by its start."""
         ...
 

@@ -339,12 +339,12 @@ class StepAdjoint:
 
     def _solve_halves(self, delassus: Rows, halves: Rows) -> None:
         """p and q where the step has left W and the half-solved sides of rows: by one solution."""
-        s, y, k, size = self.shard, self.system.linear.y, self.k_row_elements, 3 * self.model.dof_count
+        s, y, k, count = self.shard, self.system.linear.y, self.k_row_elements, self.model.row_count
         self.system.linear.forward(1)
-        s.each(k.half_gaps, self.model.row_count, [self.h, size, halves.S, y.S, self.force.S], [self.gap.S])
+        given, size = [halves.S, y.S, self.force.S], 3 * self.model.dof_count
+        s.each(k.half_gaps, s.variant.parts(count), [self.h, size, count, *given], [self.gap.S])
         self._solve_rows(delassus)
-        inputs = [-self.h, size, self.model.row_count, halves.S, self.change.S]
-        s.each(k.add_halves, s.variant.parts(size), inputs, [y.S])
+        s.each(k.add_halves, s.variant.parts(size), [-self.h, size, count, halves.S, self.change.S], [y.S])
         self.add_solution()
 
     def _solve_rows(self, delassus: Rows) -> None:

@@ -327,6 +327,36 @@ def kernels(variant: Variant) -> SimpleNamespace:
     )
 
 
+PIECE = 96  # numbers of a vector that meet all rows of a matrix before the next ones
+
+
+@wp.func_native("""
+typedef float wide_t __attribute__((vector_size(64)));
+const float* a = &wp::index(matrix, w, begin);
+const float* x = &wp::index(vector, w, 0);
+wide_t sum = {}, p, q;
+int k = first;
+for (; k + 16 <= last; k += 16) {
+    __builtin_memcpy(&p, a + k, sizeof(p));
+    __builtin_memcpy(&q, x + k, sizeof(q));
+    sum += p * q;
+}
+float total = 0.0f;
+for (int i = 0; i < 8; ++i) total += sum[i] + sum[8 + i];
+for (; k < last; ++k) total += a[k] * x[k];
+return total;
+""")
+def _one_row(
+    matrix: wp.array2d(dtype=wp.float32),
+    vector: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    first: int,
+    last: int,
+) -> wp.float32:
+    """Product of numbers of a vector with those of a matrix from ``begin`` on."""
+
+
 @wp.func_native("""
 typedef float wide_t __attribute__((vector_size(64)));
 const float* a = &wp::index(matrix, w, 0);
@@ -396,23 +426,22 @@ def element_kernels(variant: Variant) -> SimpleNamespace:
         gap_out[w, row] = known + value * h
 
     @wp.func
-    def product(matrix: wp.array2d(dtype=S), vector: wp.array2d(dtype=S), w: int, begin: int, count: int):
-        """Sum of the products of ``count`` numbers, a multiple of three, of a vector with those of a matrix."""
+    def product(matrix: wp.array2d(dtype=S), vector: wp.array2d(dtype=S), w: int, begin: int, first: int, last: int):
+        """Sum of the products of numbers, as many as a multiple of three, of a vector with those of a matrix."""
         x = S(real(0.0))
         y = S(real(0.0))
         z = S(real(0.0))
-        for k in range(0, count, 3):
+        for k in range(first, last, 3):
             x = fma(matrix[w, begin + k], vector[w, k], x)
             y = fma(matrix[w, begin + k + 1], vector[w, k + 1], y)
             z = fma(matrix[w, begin + k + 2], vector[w, k + 2], z)
         return x + y + z
 
-    dot_row = wide.one_row if is_wide else product
-
     @wp.kernel(module=module, enable_backward=False)
     def half_gaps(
         h: real,
         size: int,
+        count: int,
         # Workspace in
         half_in: wp.array2d(dtype=S),
         y_in: wp.array2d(dtype=S),
@@ -420,11 +449,24 @@ def element_kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         gap_out: wp.array2d(dtype=S),
     ):
-        """y_T + h H A^-1 y of one row, from half-solved sides of the rows and y itself, of ``size`` numbers."""
-        w, row = wp.tid()
+        """y_T + h H A^-1 y of a row, from half-solved sides of the rows and y itself, of ``size`` numbers.
+
+        On a CPU of all rows, some numbers of y after the other, which are then at hand.
+        """
+        w, part = wp.tid()
         if wp.static(world_fastest):
-            row, w = wp.tid()
-        gap_out[w, row] = force_bar_in[w, row] + dot_row(half_in, y_in, w, size * row, size) * h
+            part, w = wp.tid()
+            gap_out[w, part] = force_bar_in[w, part] + product(half_in, y_in, w, size * part, 0, size) * h
+        else:
+            for row in range(count):
+                gap_out[w, row] = force_bar_in[w, row]
+            for first in range(0, size, wp.static(PIECE)):
+                last = wp.min(first + wp.static(PIECE), size)
+                for row in range(count):
+                    if wp.static(is_wide):
+                        gap_out[w, row] += _one_row(half_in, y_in, w, size * row, first, last) * h
+                    else:
+                        gap_out[w, row] += product(half_in, y_in, w, size * row, first, last) * h
 
     @wp.kernel(module=module, enable_backward=False)
     def add_halves(
