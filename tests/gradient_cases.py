@@ -54,6 +54,7 @@ def cube(
     quadratic: bool = False,
     elastic: bool = False,
     chamber: dict[str, Any] | None = None,
+    hollow: bool = True,
     locked: bool = True,
     covered: bool = False,
     graded: bool = False,
@@ -70,6 +71,7 @@ def cube(
         elastic: The cable whose length is commanded stretches.
         chamber: Control and limits of the chamber; pressure control with a rate if left out.
         covered: Glue a membrane to the cube's surface; its corners are those of linear elements.
+        hollow: It has the chamber; without, all rows are bounded and none gives way.
         locked: A corner moves along x and z only.
         graded: The modulus grows from element to element, from 0.6 to 1.7 times.
         **options: Of the simulation.
@@ -94,7 +96,8 @@ def cube(
     builder.add_cable(body, other, control="force")
     skin = meshing.box((0.04, 0.04, 0.04), (1, 1, 1))
     law_of_air = {"max_pressure_rate": 2e4} if chamber is None else chamber
-    builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), **law_of_air)
+    if hollow:
+        builder.add_cavity(body, skin.nodes + (0.03, 0.03, 0.03), skin.surface(), **law_of_air)
     builder.add_marker(body, (SIDE, 0.05, 0.05))
     if covered:
         surface = meshing.box(size, (2, 2, 2)).surface()
@@ -111,21 +114,22 @@ def inputs(sim: sw.Simulation, seeds: list[int], strain: float = 0.1) -> Inputs:
     The pressure goes to its command as fast as its rate allows and arrives in the last step.
     """
     kept: dict[str, dict[str, list[torch.Tensor]]] = {group: {} for group in CHANGES}
+    chambers = sim.control.cavity_pressure.shape[1]
     for seed in seeds:
         rng = np.random.default_rng(seed)
         values = {
             "state": {
                 "node_x": sim.node_x[0].cpu().numpy() + 0.03 * SIDE * strain * rng.standard_normal(sim.node_x[0].shape),
                 "node_v": 0.1 * rng.standard_normal(sim.node_v[0].shape),
-                "cavity_pressure": rng.uniform(40.0, 60.0, 1),
+                "cavity_pressure": rng.uniform(40.0, 60.0, chambers),
             },
             "controls": {
                 "node_force": 0.1 * rng.standard_normal(sim.node_x[0].shape),
                 "cable_displacement": np.linspace(0.004, 0.01, STEPS)[:, None] * rng.uniform(0.8, 1.2, (STEPS, 2)),
                 "cable_tension": rng.uniform(1.0, 3.0, (STEPS, 2)),
-                "cavity_pressure": rng.uniform(500.0, 520.0, 1),
-                "cavity_volume": rng.uniform(6.5e-5, 6.6e-5, 1),
-                "cavity_gas": rng.uniform(6.5e-5, 6.6e-5, 1),
+                "cavity_pressure": rng.uniform(500.0, 520.0, chambers),
+                "cavity_volume": rng.uniform(6.5e-5, 6.6e-5, chambers),
+                "cavity_gas": rng.uniform(6.5e-5, 6.6e-5, chambers),
                 "traction": rng.uniform(-50.0, 50.0, tuple(sim.control.traction.shape[1:])),
             },
             "parameters": {

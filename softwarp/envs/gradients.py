@@ -36,8 +36,8 @@ from softwarp.gradients.worlds import DifferentiableWorlds, held_flags, told_wor
 from softwarp.model.codes import Status
 from softwarp.model.memory import free_bytes
 from softwarp.simulation import Simulation
-from softwarp.solvers.adjoint import solution_of
 from softwarp.solvers.look_adjoint import FirstSolution
+from softwarp.solvers.solution import solution_of
 
 if TYPE_CHECKING:
     from softwarp.envs.base import SoftEnv
@@ -385,7 +385,8 @@ class EnvSteps:
             worlds.place({name: record[f"start {name}"][substep] for name in self._started})
             for name, values in zip(names, commands, strict=True):
                 worlds.control[name].copy_(values[substep])
-            worlds.pull(room, substep, parameters=False)
+            solution = None if room is None else [part[substep] for part in room]
+            worlds.pull(solution, parameters=False)
             for name, found in zip(names, by_commands, strict=True):
                 found[substep].copy_(torch.where(_along(good, found[substep]), gradients[f"command_{name}"], 0.0))
         if room is not None and good.device.type == "cpu":

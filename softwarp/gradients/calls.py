@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from softwarp import interop
 from softwarp.gradients.refusals import Diverged
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.worlds import DifferentiableWorlds
@@ -34,6 +35,8 @@ class Call:
     def __init__(self, worlds: DifferentiableWorlds, plan: Plan, tensors: Tensors) -> None:
         self.worlds, self.plan, self.tensors = worlds, plan, tensors
         self.commands = [name.removeprefix("control.") for name in plan.names if name.startswith("control.")]
+        self._commands = [tensors[f"control.{name}"].unbind(0) for name in plan.moving]
+        self._commanded = [worlds.control[name] for name in plan.moving]
 
     def begin(self) -> None:
         """Everything that holds from the start on."""
@@ -54,11 +57,10 @@ class Call:
 
     def command(self, step: int) -> None:
         """Commands of one step."""
-        for name in self.plan.moving:
-            self.worlds.control[name].copy_(self.tensors[f"control.{name}"][step])
+        interop.copy_all(self._commanded, [value[step] for value in self._commands])
 
     def between(
-        self, first: dict[str, torch.Tensor], step: int, room: list[torch.Tensor] | None
+        self, first: dict[str, torch.Tensor], step: int, room: list[list[torch.Tensor]] | None
     ) -> list[dict[str, torch.Tensor]]:
         """States at the starts of the ``every`` steps after a kept one; their solutions too, if there is room."""
         worlds, states = self.worlds, [first]
@@ -69,7 +71,7 @@ class Call:
             worlds.step()
             states.append(worlds.kept())
             if room is not None:
-                worlds.keep_solution(room, offset)
+                worlds.kept_solutions.keep(room[offset])
         return states
 
 

@@ -242,12 +242,12 @@ class _Steps(torch.autograd.Function):
         count = plan.steps // plan.every
         names = (*worlds.names, *worlds.memory)
         kept = [start[name].new_empty((count, *start[name].shape)) for name in names]
-        room = worlds.solutions(plan.steps) if plan.factors and plan.every == 1 else None
+        room = worlds.kept_solutions.room(plan.steps) if plan.factors and plan.every == 1 else None
         for step in range(plan.steps):
             call.command(step)
             worlds.step()
             if room is not None:
-                worlds.keep_solution(room, step)
+                worlds.kept_solutions.keep(room[step])
             if (step + 1) % plan.every == 0:
                 for name, values in zip(names, kept, strict=True):
                     values[step // plan.every].copy_(worlds.state[name])
@@ -295,7 +295,7 @@ class _Steps(torch.autograd.Function):
         velocities = "node_v" in given
         room, ctx.room = ctx.room, None  # a second backward pass finds solutions again
         if plan.factors and plan.every > 1:
-            room = worlds.solutions(plan.every)
+            room = worlds.kept_solutions.room(plan.every)
         for segment in reversed(range(plan.steps // plan.every)):
             first = start if segment == 0 else {name: kept[name][segment - 1] for name in names}
             states = call.between(first, segment * plan.every, room if plan.every > 1 else None)
@@ -306,13 +306,13 @@ class _Steps(torch.autograd.Function):
                 step = segment * plan.every + offset
                 worlds.place(states[offset])
                 call.command(step)
-                place = step if plan.every == 1 else offset
+                solution = None if room is None else room[step if plan.every == 1 else offset]
                 end = states[offset + 1] if offset + 1 < plan.every else last
-                worlds.pull(room, place, parameters=parameters, forces=forces, velocities=velocities, end=end)
+                worlds.pull(solution, parameters=parameters, forces=forces, velocities=velocities, end=end)
                 for name, by_step in by_steps.items():
                     by_step[step].add_(gradients[f"command_{name}"])
         if room is not None:
-            worlds.give_back(room)
+            worlds.kept_solutions.give_back(room)
         check_adrift(worlds)
         check_unsure(worlds)
         found = {f"control.{name}": by for name, by in by_commands.items()}

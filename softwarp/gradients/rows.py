@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from softwarp.gradients.kept import KeptSolutions
 from softwarp.model.floating import RIGID, FloatingModel
 from softwarp.model.gradients import FRAMES, PARAMETERS, REST
 from softwarp.model.model import Model
@@ -33,6 +34,7 @@ class Worlds(Protocol):
     names: Sequence[str]
     state: Slopes
     gradients: Slopes
+    kept_solutions: KeptSolutions
 
     @property
     def solution_bytes(self) -> int:
@@ -51,19 +53,7 @@ class Worlds(Protocol):
         """Put these in place."""
         ...
 
-    def solutions(self, count: int) -> list[torch.Tensor]:
-        """Room for the solutions of some steps."""
-        ...
-
-    def keep_solution(self, room: list[torch.Tensor], place: int) -> None:
-        """Copy that of the last step."""
-        ...
-
-    def give_back(self, room: list[torch.Tensor]) -> None:
-        """Room that may be taken again."""
-        ...
-
-    def pull(self, room: list[torch.Tensor] | None = None, place: int = 0, *, parameters: bool = True) -> None:
+    def pull(self, solution: Sequence[torch.Tensor] | None = None, *, parameters: bool = True) -> None:
         """Gradients by the end of a step become those by its start."""
         ...
 
@@ -184,9 +174,9 @@ class RowDirections:
         start = worlds.kept()
         worlds.take()
         end = worlds.kept()
-        room = worlds.solutions(1) if worlds.solution_bytes else None
+        room = worlds.kept_solutions.room(1) if worlds.solution_bytes else None
         if room is not None:
-            worlds.keep_solution(room, 0)
+            worlds.kept_solutions.keep(room[0])
         worlds.place(start)
         parameters = any(name in (*PARAMETERS, *REST) for name in held)
         found = {
@@ -197,12 +187,12 @@ class RowDirections:
             for view in worlds.gradients.values():
                 view.zero_()
             worlds.gradients[name].flatten(1)[:, row] = 1.0
-            worlds.pull(room, parameters=parameters)
+            worlds.pull(None if room is None else room[0], parameters=parameters)
             total = found[name].flatten(2)[..., row]  # sums one after the other: the same bits in every batch
             for each, directions in held.items():
                 total += (worlds.gradients[each].flatten(1) * directions).cumsum(dim=-1)[..., -1]
         if room is not None:
-            worlds.give_back(room)
+            worlds.kept_solutions.give_back(room)
         worlds.place(end)
         x, v = found["node_x"], found["node_v"]
         before = held["node_x"].reshape(x.shape) if "node_x" in held else torch.zeros_like(x)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from softwarp import interop
+from softwarp.gradients.kept import KeptSolutions
+from softwarp.gradients.replayed import Replayed
 from softwarp.gradients.rows import RowDirections
 from softwarp.model.codes import Status
 from softwarp.model.gradients import (
@@ -47,43 +49,6 @@ if TYPE_CHECKING:
 
 Flags = list[tuple[tuple[int, int], "torch.Tensor"]]  # those of some worlds each, not 0 where there is something
 LAG = 1.0e-3  # m/s and rad/s, beside commands of up to 1: what rounding may make of a velocity
-
-
-class Replayed:
-    """Launches that are recorded at their second call and replayed from then on, those of shards side by side.
-
-    Args:
-        device: Warp device.
-        launches: One function a shard.
-        workers: Threads for several shards.
-    """
-
-    def __init__(self, device: str, launches: Sequence[Callable[[], None]], workers: Workers | None) -> None:
-        self._device, self._launches, self._workers = device, launches, workers
-        self._is_compiled = False  # by the first call, which a recording cannot do
-        self._graphs: list[Any] = []
-
-    def __call__(self) -> None:
-        """Launch all."""
-        if not (self._is_compiled and interop.records(self._device)):
-            with interop.on_torch_stream(self._device):
-                for launch in self._launches:
-                    launch()
-            self._is_compiled = True
-            return
-        if not self._graphs:
-            self._graphs = [self._record(launch) for launch in self._launches]
-        with interop.replaying(self._device):
-            if self._workers is None:
-                for graph in self._graphs:
-                    wp.capture_launch(graph)
-            else:
-                self._workers.run(wp.capture_launch, self._graphs, helping=True)
-
-    def _record(self, launch: Callable[[], None]) -> Any:
-        with interop.capturing(self._device) as capture:
-            launch()
-        return capture.graph
 
 
 class OwnArrays:
@@ -215,6 +180,7 @@ class DifferentiableWorlds:
         if self._held:
             memory = (*memory, "compression")  # worlds that begin a step inverted may be held back
         self.memory = tuple(name for name in memory if name not in self.names)
+        self._carried = {name: self.state[name] for name in (*self.names, *self.memory) if self.state[name].numel()}
         steppers = [stepper(system, self.h) for _, system in twins]
         parts = [room.part(each) for each, _ in twins]
         pulls = [
@@ -227,17 +193,19 @@ class DifferentiableWorlds:
         self._directions: Directions | RowDirections | None = None
         self._step = Replayed(model.device, [stepper.step for stepper in steppers], workers)
         self._refresh = Replayed(model.device, [system.refresh for _, system in twins], workers)
+        launches = {
+            (name, parameters, *way): [_launches(pull, of_pull, *way) for pull in pulls]
+            for name in ("step", "prepare", "pull")
+            for parameters, of_pull in ((True, name), (False, f"{name}_alone"))
+            for way in product((True, False), repeat=3)
+            if hasattr(pulls[0], of_pull)
+        }
         self._pull, self._prepare, self._pull_kept = (
-            {
-                (parameters, *way): Replayed(model.device, [_launches(pull, of_pull, *way) for pull in pulls], workers)
-                for parameters, of_pull in ((True, name), (False, f"{name}_alone"))
-                for way in product((True, False), repeat=3)
-                if hasattr(pulls[0], of_pull)
-            }
+            {key[1:]: Replayed(model.device, each, workers) for key, each in launches.items() if key[0] == name}
             for name in ("step", "prepare", "pull")
         )
-        self._solution = [wp.to_torch(array, requires_grad=False) for pull in pulls for array in pull.solution]
-        self._spare: list[list[torch.Tensor]] = []
+        self._of_kept = {key[1:]: each for key, each in launches.items() if key[0] == "pull"}
+        self.kept_solutions = KeptSolutions(model.device, pulls, workers)
         self.pressed = torch.zeros_like(self.state["compression"])
         self.failed, self.unfinished, self.lagging = (
             torch.zeros(model.num_worlds, dtype=torch.bool, device=self.state["time"].device) for _ in range(3)
@@ -363,8 +331,7 @@ class DifferentiableWorlds:
 
     def place(self, state: dict[str, torch.Tensor]) -> None:
         """Put positions, velocities, tensions and pressures in place, and the memory of contacts."""
-        for name in (*self.names, *self.memory):
-            self.state[name].copy_(state[name])
+        interop.copy_all(list(self._carried.values()), [state[name] for name in self._carried])
 
     def kept(self) -> dict[str, torch.Tensor]:
         """Copies of these."""
@@ -373,29 +340,11 @@ class DifferentiableWorlds:
     @property
     def solution_bytes(self) -> int:
         """What the solution of one step takes, factors included [B]."""
-        return sum(part.nbytes for part in self._solution)
-
-    def solutions(self, count: int) -> list[torch.Tensor]:
-        """Room for the solutions of some steps, each tensor with a leading axis of steps."""
-        for room in self._spare:
-            if len(room[0]) == count:
-                self._spare = []
-                return room
-        return [part.new_empty((count, *part.shape)) for part in self._solution]
-
-    def give_back(self, room: list[torch.Tensor]) -> None:
-        """Room that may be taken again: touching new memory takes a system longer than copying into it."""
-        self._spare = [room]
-
-    def keep_solution(self, room: list[torch.Tensor], place: int) -> None:
-        """Copy that of the last step."""
-        for held, part in zip(room, self._solution, strict=True):
-            held[place].copy_(part)
+        return self.kept_solutions.nbytes
 
     def pull(
         self,
-        room: list[torch.Tensor] | None = None,
-        place: int = 0,
+        solution: Sequence[torch.Tensor] | None = None,
         *,
         parameters: bool = True,
         forces: bool = True,
@@ -405,8 +354,7 @@ class DifferentiableWorlds:
         """Gradients by the end of the step from the present state become those by the present state, in place.
 
         Args:
-            room: Kept solutions, among them that of this step; without, it is found again.
-            place: Where it is.
+            solution: That of this step, if it was kept; without, it is found again.
             parameters: Whether gradients by parameters are asked for, which else stay as they are.
             forces: Whether those by node forces and tractions are, which else need not be found.
             velocities: Whether there may be some by velocities of nodes at the end of the step.
@@ -419,13 +367,12 @@ class DifferentiableWorlds:
                     view.copy_(end[name])
         follows = self.model.reduction is not None
         key = parameters, forces, velocities or not follows, is_known
-        if room is None:
+        if solution is None:
             self._pull[key]()
             return
         self._prepare[key]()
-        for held, part in zip(room, self._solution, strict=True):
-            part.copy_(held[place])
-        self._pull_kept[key]()
+        if not self.kept_solutions.pull(key, self._of_kept[key], solution):
+            self._pull_kept[key]()
 
 
 def _adjoint(

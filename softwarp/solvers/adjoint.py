@@ -6,6 +6,8 @@ serves both; what it adds are the derivatives of A, b and H by positions and par
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from softwarp.kernels.elements import adjoint_sums, traction
@@ -15,13 +17,14 @@ from softwarp.model.cavities import CavityModel
 from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
-from softwarp.solvers.contact_adjoint import ContactAdjoint, contact_solution
+from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
 from softwarp.solvers.leaning_adjoint import Leaning, LeaningFrames
 from softwarp.solvers.membrane_adjoint import MembraneAdjoint
 from softwarp.solvers.mode_adjoint import ModeAdjoint
 from softwarp.solvers.multipliers import BoundedMultipliers
+from softwarp.solvers.solution import half_sides, solution_of
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.membranes import MembraneTerm
 from softwarp.solvers.terms.quadratic import QuadraticTerm
@@ -31,24 +34,6 @@ from softwarp.solvers.terms.tets import TetTerm
 from softwarp.solvers.workspace.rows import Rows, allocate
 
 LOADS = ("command_node_force", "v0")  # inputs that only a solution, gradients by parameters and contacts need
-
-
-def solution_of(system: System) -> list[wp.array]:
-    """Arrays in which a system that has taken a step holds its solution, factors included."""
-    w = system.shard.work
-    kept = [w.dof_v.real, *system.linear.factors]
-    if system.shard.model.row_count:
-        kept += [w.row.real, w.multiplier.real]
-    if system.model.reduction is not None and system.model.reduction.floating is not None:
-        kept += [w.wide_drag.real, w.turning_drag.real]
-    is_bounded = isinstance(system.multipliers, BoundedMultipliers)
-    if is_bounded:
-        kept.append(w.delassus.real)
-    if is_bounded or system.options.refinement > 0:
-        kept.append(w.a.real)
-    if system.free is not None:
-        kept.append(system.free.excess.real)
-    return kept if system.contact is None else [*kept, *contact_solution(system.contact)]
 
 
 class StepAdjoint:
@@ -135,11 +120,18 @@ class StepAdjoint:
                 self.contact.take_listed(self.modes.model.node, self.modes.listed, self.modes.listed_v)
         self.by_forces = True
         self.delassus_known = s.work.delassus if isinstance(system.multipliers, BoundedMultipliers) else None
+        self.halves = None if self.predicts else half_sides(system)
 
     @property
     def solution(self) -> list[wp.array]:
         """What a step leaves behind for ``pull``; put back after ``prepare``, it stands for ``solve_again``."""
         return solution_of(self.system)
+
+    @property
+    def long_parts(self) -> list[tuple[Any, str]]:
+        """What holds the parts of the solution that few launches read, and what it calls them: none on a GPU."""
+        held = [(self.system.linear, "lower"), (self.shard.work, "a"), (self, "halves")]
+        return [] if self.shard.variant.world_fastest else held[: 2 + (self.halves is not None)]
 
     def step(self) -> None:
         """Gradients by the end of the step from the system's state become those by its start."""
@@ -271,6 +263,8 @@ class StepAdjoint:
         if self.delassus_known is None:
             for correction in range(1 + self.system.options.refinement):
                 self.solve(correction)
+        elif self.halves is not None:
+            self._solve_halves(self.delassus_known, self.halves)
         else:
             self._solve_known(self.delassus_known)
 
@@ -339,11 +333,25 @@ class StepAdjoint:
                 inputs = [m.dof_count, count, self.index.row_pair, y.S, h * h]
                 s.each(rows.k.delassus, len(self.index.row_pair), inputs, [self.delassus.S])
             self._row_gaps(self.gap)
-            inputs = [count, self.delassus.real, w.compliance.real, self.active.real, self.gap.real]
-            outputs = [self.factor.real, self.change.real, self.q.real]
-            s.each_real(self.k_rows.solve, None, inputs, outputs)
+            self._solve_rows(self.delassus)
             s.each(rows.k.add_change, s.variant.parts(s.dof_rows), [m.dof_count, count, self.change.S, -h], [y.S])
         self.add_solution()
+
+    def _solve_halves(self, delassus: Rows, halves: Rows) -> None:
+        """p and q where the step has left W and the half-solved sides of rows: by one solution."""
+        s, y, k, count = self.shard, self.system.linear.y, self.k_row_elements, self.model.row_count
+        self.system.linear.forward(1)
+        given, size = [halves.S, y.S, self.force.S], 3 * self.model.dof_count
+        s.each(k.half_gaps, s.variant.parts(count), [self.h, size, count, *given], [self.gap.S])
+        self._solve_rows(delassus)
+        s.each(k.add_halves, s.variant.parts(size), [-self.h, size, count, halves.S, self.change.S], [y.S])
+        self.add_solution()
+
+    def _solve_rows(self, delassus: Rows) -> None:
+        """q += (W + C)^-1 gap."""
+        w = self.shard.work
+        inputs = [self.model.row_count, delassus.real, w.compliance.real, self.active.real, self.gap.real]
+        self.shard.each_real(self.k_rows.solve, None, inputs, [self.factor.real, self.change.real, self.q.real])
 
     def _solve_known(self, delassus: Rows) -> None:
         """p and q where the step has left W: q from the solution without rows, so that no side is solved for.
@@ -351,13 +359,10 @@ class StepAdjoint:
         A pass is a solution with what p and q leave of the first equation; the first one brings q = 0, the second what
         q adds and what rounding has left, which further ones do again.
         """
-        s, m, w = self.shard, self.model, self.shard.work
         self._correct(first=True)
         for _ in range(max(1, self.system.options.refinement)):
             self._find_gaps(self.q, self.gap)
-            inputs = [m.row_count, delassus.real, w.compliance.real, self.active.real, self.gap.real]
-            outputs = [self.factor.real, self.change.real, self.q.real]
-            s.each_real(self.k_rows.solve, None, inputs, outputs)
+            self._solve_rows(delassus)
             self._correct(first=False)
 
     def _correct(self, *, first: bool) -> None:
@@ -503,10 +508,6 @@ class StepAdjoint:
             start_v = self.surface.rest_v if self.leaning is None else self.leaning.start_v
             self.surface.pull(self.p, start_v, self.point, g.cavity_pressure)
 
-    def _nodal(self) -> list[wp.array]:
-        """v and p of nodes."""
-        return [self.node_v.real, self.node_p.real]
-
     def _to_state(self) -> None:
         """Gradients by positions, velocities and forces of nodes."""
         s, m, i, g, x = self.shard, self.model, self.shard.input, self.gradients, self.index
@@ -550,9 +551,8 @@ class StepAdjoint:
         self._to_tractions()
 
     def _to_tractions(self) -> None:
-        s, m, g = self.shard, self.model, self.gradients
-        if m.tractions is not None:
-            t = m.tractions
+        s, t, g = self.shard, self.model.tractions, self.gradients
+        if t is not None:
             inputs = [s.lanes, int(t.loaded_node.size), t.loaded_node, t.entry_start, t.entry_traction, t.entry_share]
             kernel = traction.kernels(s.variant).by_tractions
             s.each_real(kernel, t.count, [*inputs, g.command_node_force], [g.command_traction])
@@ -562,7 +562,7 @@ class StepAdjoint:
         s, m, i, w, g, x = self.shard, self.model, self.shard.input, self.shard.work, self.gradients, self.index
         scalars = [self.h, s.lanes]
         inputs = [*scalars, x.body_node_start, x.node_heft, i["density"].real, w.body_mass.real]
-        inputs += [i["gravity"].real, i["v0"].real, *self._nodal(), self.node_mass_p.real]
+        inputs += [i["gravity"].real, i["v0"].real, self.node_v.real, self.node_p.real, self.node_mass_p.real]
         s.each_real(self.k.bodies, m.body_count, inputs, [g.density, g.rayleigh_mass])
         if self.tets is not None:
             self._to_moduli(x.body_tets, self.tets.parameter)

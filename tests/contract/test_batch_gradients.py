@@ -20,6 +20,11 @@ PATHS = [
     pytest.param(NEWTON | {"solver_path": "scalar"}, "float64", "cpu", id="newton_float64", marks=pytest.mark.slow),
     pytest.param(QUADRATIC | {"solver_path": "lanes"}, "float32", "cpu", id="quadratic", marks=pytest.mark.slow),
     pytest.param({"solver_path": "panels"}, "float32", "cuda:0", id="panels", marks=pytest.mark.cuda),
+    pytest.param({"solver_path": "lanes", "hollow": False}, "float32", "cpu", id="cables"),
+    pytest.param(
+        {"solver_path": "levels", "hollow": False}, "float32", "cuda:0", id="cables_cuda", marks=pytest.mark.cuda
+    ),
+    pytest.param({"solver_path": "levels"}, "float32", "cuda:0", id="euler_levels", marks=pytest.mark.cuda),
     pytest.param(
         QUADRATIC | {"solver_path": "panels"}, "float32", "cuda:0", id="quadratic_cuda", marks=pytest.mark.cuda
     ),
@@ -58,3 +63,18 @@ def test_lanes_agree_with_one_world_at_a_time() -> None:
         for name, value in held.items():
             error = (found[1][group][name] - value).abs().max()
             assert error <= 2e-3 * value.abs().max(), (group, name)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("path", ["panels", "levels"])
+def test_a_gpu_agrees_with_a_cpu(path: str) -> None:
+    """In float64, with factors kept and without."""
+    found = []
+    for device, own, factors in (("cpu", "auto", False), ("cuda:0", path, False), ("cuda:0", path, True)):
+        sim = cube(num_worlds=2, device=device, solver_path=own, hollow=False)
+        found.append(gradients(Rollout(sim), inputs(sim, [1, 2]), weights(sim), factors=factors))
+    for group, held in found[0].items():
+        for name, value in held.items():
+            for other in found[1:]:
+                close = {"rtol": 1e-8, "atol": 1e-8 * float(value.abs().max())}
+                torch.testing.assert_close(other[group][name].cpu(), value, **close)

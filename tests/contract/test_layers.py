@@ -39,7 +39,7 @@ LAYERS = (
     ("solvers.joint_sides",),
     ("solvers.leaning_adjoint", "solvers.membrane_adjoint"),
     ("solvers.floating_adjoint",),
-    ("solvers.mode_adjoint",),
+    ("solvers.mode_adjoint", "solvers.solution"),
     ("solvers.adjoint", "solvers.contact_directional"),
     ("solvers.implicit_euler", "solvers.outputs", "solvers.quasi_static"),
     ("solvers.repeats",),

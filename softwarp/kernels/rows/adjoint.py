@@ -18,6 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from softwarp.kernels.algebra import wide
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.algebra.vectors import algebra
 
@@ -326,11 +327,72 @@ def kernels(variant: Variant) -> SimpleNamespace:
     )
 
 
+PIECE = 96  # numbers of a vector that meet all rows of a matrix before the next ones
+
+
+@wp.func_native("""
+typedef float wide_t __attribute__((vector_size(64)));
+const float* a = &wp::index(matrix, w, begin);
+const float* x = &wp::index(vector, w, 0);
+wide_t sum = {}, p, q;
+int k = first;
+for (; k + 16 <= last; k += 16) {
+    __builtin_memcpy(&p, a + k, sizeof(p));
+    __builtin_memcpy(&q, x + k, sizeof(q));
+    sum += p * q;
+}
+float total = 0.0f;
+for (int i = 0; i < 8; ++i) total += sum[i] + sum[8 + i];
+for (; k < last; ++k) total += a[k] * x[k];
+return total;
+""")
+def _one_row(
+    matrix: wp.array2d(dtype=wp.float32),
+    vector: wp.array2d(dtype=wp.float32),
+    w: int,
+    begin: int,
+    first: int,
+    last: int,
+) -> wp.float32:
+    """Product of numbers of a vector with those of a matrix from ``begin`` on."""
+
+
+@wp.func_native("""
+typedef float wide_t __attribute__((vector_size(64)));
+const float* a = &wp::index(matrix, w, 0);
+const float* c = &wp::index(factor, w, 0);
+float* y = &wp::index(vector_out, w, 0);
+wide_t sum, p;
+int k = 0;
+for (; k + 16 <= count; k += 16) {
+    __builtin_memcpy(&sum, y + k, sizeof(sum));
+    for (int r = 0; r < rows; ++r) {
+        __builtin_memcpy(&p, a + count * r + k, sizeof(p));
+        sum += p * (scale * c[r]);
+    }
+    __builtin_memcpy(y + k, &sum, sizeof(sum));
+}
+for (; k < count; ++k)
+    for (int r = 0; r < rows; ++r) y[k] += a[count * r + k] * (scale * c[r]);
+""")
+def _add_rows(
+    vector_out: wp.array2d(dtype=wp.float32),
+    matrix: wp.array2d(dtype=wp.float32),
+    factor: wp.array2d(dtype=wp.float32),
+    w: int,
+    rows: int,
+    count: int,
+    scale: wp.float32,
+):
+    """Add rows of a matrix, of ``count`` numbers each, times factors to a vector."""
+
+
 @cache
 def element_kernels(variant: Variant) -> SimpleNamespace:
     """Kernels on the elements of a variant, (w, row)."""
     S, real, world_fastest = variant.S, variant.real, variant.world_fastest
     mul, fma, div, sqrt, select = variant.mul, variant.fma, variant.div, variant.sqrt, variant.select
+    is_wide = wide.is_wide(variant)
     module = variant.module("adjoint.row_elements")
     a = algebra(variant)
     read_vector, write_vector = a.read_vector, a.write_vector
@@ -362,6 +424,75 @@ def element_kernels(variant: Variant) -> SimpleNamespace:
                 value = fma(row_in[w, 3 * entry + c], dof_p_in[w, dof + c], value)
         known = force_bar_in[w, row] - mul(compliance_in[w, row], q_in[w, row])
         gap_out[w, row] = known + value * h
+
+    @wp.func
+    def product(matrix: wp.array2d(dtype=S), vector: wp.array2d(dtype=S), w: int, begin: int, first: int, last: int):
+        """Sum of the products of numbers, as many as a multiple of three, of a vector with those of a matrix."""
+        x = S(real(0.0))
+        y = S(real(0.0))
+        z = S(real(0.0))
+        for k in range(first, last, 3):
+            x = fma(matrix[w, begin + k], vector[w, k], x)
+            y = fma(matrix[w, begin + k + 1], vector[w, k + 1], y)
+            z = fma(matrix[w, begin + k + 2], vector[w, k + 2], z)
+        return x + y + z
+
+    @wp.kernel(module=module, enable_backward=False)
+    def half_gaps(
+        h: real,
+        size: int,
+        count: int,
+        # Workspace in
+        half_in: wp.array2d(dtype=S),
+        y_in: wp.array2d(dtype=S),
+        force_bar_in: wp.array2d(dtype=S),
+        # Workspace out
+        gap_out: wp.array2d(dtype=S),
+    ):
+        """y_T + h H A^-1 y of a row, from half-solved sides of the rows and y itself, of ``size`` numbers.
+
+        On a CPU of all rows, some numbers of y after the other, which are then at hand.
+        """
+        w, part = wp.tid()
+        if wp.static(world_fastest):
+            part, w = wp.tid()
+            gap_out[w, part] = force_bar_in[w, part] + product(half_in, y_in, w, size * part, 0, size) * h
+        else:
+            for row in range(count):
+                gap_out[w, row] = force_bar_in[w, row]
+            for first in range(0, size, wp.static(PIECE)):
+                last = wp.min(first + wp.static(PIECE), size)
+                for row in range(count):
+                    if wp.static(is_wide):
+                        gap_out[w, row] += _one_row(half_in, y_in, w, size * row, first, last) * h
+                    else:
+                        gap_out[w, row] += product(half_in, y_in, w, size * row, first, last) * h
+
+    @wp.kernel(module=module, enable_backward=False)
+    def add_halves(
+        scale: real,
+        size: int,
+        count: int,
+        # Workspace in
+        half_in: wp.array2d(dtype=S),
+        change_in: wp.array2d(dtype=S),
+        # Workspace out
+        y_out: wp.array2d(dtype=S),
+    ):
+        """Add half-solved sides of ``count`` rows times their changes and ``scale`` to y; on a CPU, all numbers."""
+        w, part = wp.tid()
+        if wp.static(is_wide):
+            _add_rows(y_out, half_in, change_in, w, count, size, scale)
+        else:
+            last = size
+            if wp.static(world_fastest):
+                part, w = wp.tid()
+                last = part + 1
+            for k in range(part, last):
+                value = y_out[w, k]
+                for row in range(count):
+                    value = fma(half_in[w, size * row + k], change_in[w, row] * scale, value)
+                y_out[w, k] = value
 
     @wp.func
     def segment(x: wp.array2d(dtype=S), way: wp.array2d(dtype=S), w: int, last: int, closing: S):
@@ -401,4 +532,4 @@ def element_kernels(variant: Variant) -> SimpleNamespace:
             total = add(total, segment(point_x_in, way_in, w, point + 1, closing))
         write_vector(point_bar_out, w, 3 * point, total)
 
-    return SimpleNamespace(gaps=gaps, cable_points=cable_points)
+    return SimpleNamespace(gaps=gaps, half_gaps=half_gaps, add_halves=add_halves, cable_points=cable_points)

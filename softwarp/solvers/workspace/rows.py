@@ -65,6 +65,12 @@ def alias(variant: Variant, array: wp.array) -> Rows:
     return Rows(S=array, real=base)
 
 
+def at_address(variant: Variant, like: wp.array, address: int) -> Rows:
+    """View memory that somebody else holds as a workspace array; ``like`` has its shape [pack, row, lane]."""
+    base = wp.array(ptr=address, shape=like.shape, dtype=like.dtype, device=like.device)
+    return Rows(S=_element_view(variant, base, like.shape[1], like.dtype), real=base)
+
+
 def _element_view(variant: Variant, base: wp.array, rows: int, real: Any) -> wp.array:
     packs, _, lanes = base.shape
     size = wp.types.type_size_in_bytes(real)

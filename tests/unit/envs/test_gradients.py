@@ -113,9 +113,9 @@ def test_steps_of_one_environment_keep_what_each_is_told_to(monkeypatch: pytest.
         steps = EnvSteps(env, factors=factors)
         pull = steps.worlds.pull
 
-        def noted(room: object, substep: int, *, parameters: bool, pull: object = pull) -> None:
-            kept.append(room is not None)
-            pull(room, substep, parameters=parameters)
+        def noted(solution: object, *, parameters: bool, pull: object = pull) -> None:
+            kept.append(solution is not None)
+            pull(solution, parameters=parameters)
 
         monkeypatch.setattr(steps.worlds, "pull", noted)
         action = torch.full((1, 4), 0.5, requires_grad=True)

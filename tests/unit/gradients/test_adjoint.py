@@ -76,6 +76,13 @@ def test_refinement(refinement: int, integrator: str) -> None:
     check(Rollout(sim), inputs(sim, [1]), weights(sim))
 
 
+@pytest.mark.parametrize("refinement", [1, 2])
+def test_cables_alone(refinement: int) -> None:
+    """Rows that are all bounded: by half-solved sides, or by passes of refinement."""
+    sim = cube("warped", refinement=refinement, hollow=False)
+    check(Rollout(sim), inputs(sim, [1]), weights(sim))
+
+
 @pytest.mark.parametrize("graded", [False, True])
 def test_gradients_of_the_exact_tangent(graded: bool) -> None:
     """Without projection, A has negative eigenvalues of elements in it; elements may have moduli of their own."""

@@ -49,6 +49,35 @@ def test_kept_states_and_factors_change_no_bit() -> None:
                     assert torch.equal(value, plain[group][name]), (every, factors, name)
 
 
+@pytest.mark.parametrize(("path", "precision"), [("scalar", "float64"), ("scalar", "float32"), ("lanes", "float32")])
+def test_factors_are_read_where_they_are_kept(path: str, precision: str) -> None:
+    """From the third pass through the same memory on, which has the bits of those before and of steps solved again."""
+    sim = cube(num_worlds=2, precision=precision, solver_path=path, hollow=False)
+    rollout, given, loss = Rollout(sim), inputs(sim, [1, 2]), weights(sim)
+    other = inputs(sim, [3, 4])
+    plain = gradients(rollout, given, loss)
+    for _ in range(4):
+        gradients(rollout, other, loss, factors=True)  # where steps have their factors there are those of others
+        found = gradients(rollout, given, loss, factors=True)
+        for group, held in found.items():
+            for name, value in held.items():
+                assert torch.equal(value, plain[group][name]), name
+
+
+def test_sides_of_rows_are_kept_instead_of_the_matrix() -> None:
+    """A step with few bounded rows keeps L^-1 H'; where more refinement is asked for it keeps A, and goes by that."""
+    found, sizes = [], []
+    for refinement in (1, 2):
+        sim = cube(hollow=False, refinement=refinement)
+        rollout = Rollout(sim)
+        sizes.append(rollout.solution_bytes)
+        found.append(gradients(rollout, inputs(sim, [1]), weights(sim), factors=True))
+    assert sizes[0] < sizes[1]
+    for group, held in found[0].items():
+        for name, value in held.items():
+            torch.testing.assert_close(value, found[1][group][name], rtol=1e-9, atol=1e-9 * float(value.abs().max()))
+
+
 def test_two_graphs_at_once() -> None:
     """Backward passes do not depend on what was called in between, and may be repeated."""
     sim = cube()
