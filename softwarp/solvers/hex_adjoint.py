@@ -37,7 +37,7 @@ class HexAdjoint:
         """Gradients by corners and by parameters; as ``TetAdjoint.pull``."""
         s, t, m, w = self.shard, self.term, self.term.model, self.shard.work
         inputs = [t.first, hexahedral.CORNERS, m.mode_ratio.shape[1], parameters, h, m.hex_node, *t.elements]
-        inputs += [m.hex_volume, m.shape_x, m.shape_gradient, m.shape_mu, m.shape_lam]
+        inputs += [m.hex_volume, m.shape_x, m.shape_gradient, m.shape_lam]
         inputs += [m.mode_mu, m.mode_lam, m.mode_ratio, s.model.body_guard]
         inputs += [w.body_mu.real, w.body_lam.real, stiffness.real, w.hex_stiffness.real]
         inputs += [w.x.real, v.real, p.real]

@@ -30,6 +30,64 @@ from softwarp.kernels.elements.adjoint import functions as of_tets
 SIZE = 3 * hexahedral.CORNERS
 
 
+# Sums in registers, of one world and of one in lanes; their order is one of the compiler's, always the same.
+_PRODUCT = """
+#pragma clang fp contract(fast) reassociate(on)
+const REAL* const k = &wp::index(stiffness, pack, first, lane);
+const int step = stiffness.strides[1] / sizeof(REAL);
+REAL s[SIZE] = {};
+if (step == 1) {
+    for (int j = 3; j < SIZE; ++j)
+        for (int i = 0; i < SIZE; ++i) s[i] += k[SIZE * j + i] * u.c[j];
+} else {
+    for (int j = 3; j < SIZE; ++j)
+        for (int i = 0; i < SIZE; ++i) s[i] += k[step * (SIZE * j + i)] * u.c[j];
+}
+wp::vec_t<SIZE, REAL> f;
+for (int i = 0; i < SIZE; ++i) f.c[i] = s[i];
+for (int i = 0; i < 3; ++i) f.c[i] = 0;
+return f;
+"""
+_BY_LAM = """
+#pragma clang fp contract(fast) reassociate(on)
+REAL total[9] = {}, value = 0;
+for (int m = 1; m < SIZE / 3; ++m)
+    for (int n = 1; n <= m; ++n) {
+        const REAL* const e = &wp::index(blocks, shape, 9 * (m * (m + 1) / 2 + n));
+        const REAL both = n < m ? 1 : 0;  // sides of a block off the diagonal
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {
+                const REAL other = both * d.c[3 * m + i] * u.c[3 * n + j];
+                total[3 * i + j] += e[3 * i + j] * (u.c[3 * m + i] * d.c[3 * n + j] + other);
+            }
+    }
+for (int i = 0; i < 9; ++i) value += total[i];
+for (int mode = 0; mode < modes; ++mode) {
+    const REAL* const a = &wp::index(mode_mu, shape, SIZE * mode);
+    const REAL* const b = &wp::index(mode_lam, shape, SIZE * mode);
+    REAL cu = 0, cd = 0, bu = 0, bd = 0;
+    for (int i = 3; i < SIZE; ++i) {
+        const REAL c = mu * a[i] + lam * b[i];
+        cu += c * u.c[i];
+        cd += c * d.c[i];
+        bu += b[i] * u.c[i];
+        bd += b[i] * d.c[i];
+    }
+    const REAL ratio = wp::index(mode_ratio, shape, mode), over = 1 / (mu + lam * ratio);
+    cu *= over;
+    cd *= over;
+    value -= bu * cd + cu * bd - ratio * cu * cd;
+}
+return value;
+"""
+
+
+def _native(variant: Variant, text: str) -> str:
+    """A snippet for a scalar type; compilers for GPUs do not know its pragma."""
+    text = text.replace("REAL", "double" if variant.real is wp.float64 else "float").replace("SIZE", str(SIZE))
+    return text.replace("#pragma clang fp contract(fast) reassociate(on)\n", "") if variant.world_fastest else text
+
+
 @cache
 def functions(variant: Variant) -> SimpleNamespace:
     """Rotation, guard and products with K of one hexahedron; arrays are those of single worlds, (pack, row, lane)."""
@@ -88,18 +146,9 @@ def functions(variant: Variant) -> SimpleNamespace:
         Q = nearest(rows(x, y, vector(F[2, 0], F[2, 1], F[2, 2])))
         return mat33(Q.xx, Q.xy, Q.xz, Q.yx, Q.yy, Q.yz, Q.zx, Q.zy, Q.zz)
 
-    @wp.func
-    def product(stiffness: wp.array3d(dtype=real), pack: int, lane: int, shape: int, u: corners_of):
-        """K u; the first corner has u = 0."""
-        f = corners_of()
-        size = int(wp.static(SIZE))  # loops that stay some
-        for i in range(3, size):
-            row = wp.static(hexahedral.STORED_ROWS) * shape + size * i
-            total = real(0.0)
-            for j in range(3, size):
-                total += stiffness[pack, row + j, lane] * u[j]
-            f[i] = total
-        return f
+    @wp.func_native(_native(variant, _PRODUCT))
+    def product(stiffness: wp.array3d(dtype=real), pack: int, lane: int, first: int, u: corners_of) -> corners_of:
+        """K u from row ``first`` of K; the first corner has u = 0."""
 
     @wp.func
     def cross_sum(a: corners_of, b: corners_of, corners: int):
@@ -194,8 +243,9 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """sum a_a . b_a."""
         return wp.dot(a, b)
 
-    @wp.func
-    def by_constants(
+    @wp.func_native(_native(variant, _BY_LAM))
+    def by_lam(
+        blocks: wp.array2d(dtype=real),
         mode_mu: wp.array2d(dtype=real),
         mode_lam: wp.array2d(dtype=real),
         mode_ratio: wp.array2d(dtype=real),
@@ -205,44 +255,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
         modes: int,
         u: corners_of,
         d: corners_of,
-    ):
-        """What eliminated modes take from u' dK/dmu d and u' dK/dlam d."""
-        by_mu = real(0.0)
-        by_lam = real(0.0)
-        size = int(wp.static(SIZE))
-        for mode in range(modes):
-            au = real(0.0)
-            bu = real(0.0)
-            ad = real(0.0)
-            bd = real(0.0)
-            for i in range(3, size):
-                row = size * mode + i
-                au += mode_mu[shape, row] * u[i]
-                bu += mode_lam[shape, row] * u[i]
-                ad += mode_mu[shape, row] * d[i]
-                bd += mode_lam[shape, row] * d[i]
-            ratio = mode_ratio[shape, mode]
-            over = real(1.0) / (mu + lam * ratio)
-            cu = (mu * au + lam * bu) * over
-            cd = (mu * ad + lam * bd) * over
-            by_mu -= au * cd + cu * ad - cu * cd
-            by_lam -= bu * cd + cu * bd - ratio * cu * cd
-        return by_mu, by_lam
-
-    @wp.func
-    def by_blocks(shape_part: wp.array2d(dtype=real), shape: int, corners: int, u: corners_of, d: corners_of):
-        """u' D d of a matrix kept by its blocks a >= b."""
-        total = real(0.0)
-        for m in range(1, corners):
-            for n in range(1, m + 1):
-                place = 9 * (m * (m + 1) / 2 + n)
-                for i in range(3):
-                    for j in range(3):
-                        entry = shape_part[shape, place + 3 * i + j]
-                        total += entry * u[3 * m + i] * d[3 * n + j]
-                        if n < m:
-                            total += entry * d[3 * m + i] * u[3 * n + j]
-        return total
+    ) -> real:
+        """u' dK/dlam d from the blocks of the corners and the modes."""
 
     @wp.kernel(module=module, enable_backward=False)
     def hex_adjoint(
@@ -259,7 +273,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
         hex_volume: wp.array(dtype=real),
         shape_x: wp.array2d(dtype=real),
         shape_gradient: wp.array2d(dtype=real),
-        shape_mu: wp.array2d(dtype=real),
         shape_lam: wp.array2d(dtype=real),
         mode_mu: wp.array2d(dtype=real),
         mode_lam: wp.array2d(dtype=real),
@@ -291,16 +304,17 @@ def kernels(variant: Variant) -> SimpleNamespace:
         u = y
         for i in range(3 * corners):
             u[i] = y[i] - shape_x[shape, i]
-        f = product(shape_stiffness_in, pack, lane, shape, u)
+        first_of_shape = wp.static(hexahedral.STORED_ROWS) * shape
+        f = product(shape_stiffness_in, pack, lane, first_of_shape, u)
         A = gradient_of(p, shape_gradient, shape, corners)
         inverse = inverse_of_turning(S)
         w = inverse * axial(A)
         along = p
         for m in range(1, corners):
             along = put_corner(along, m, corner(p, m) - wp.cross(w, corner(y, m)))
-        stiff_v = product(shape_stiffness_in, pack, lane, shape, v)
-        stiff_p = product(shape_stiffness_in, pack, lane, shape, p)
-        bent = product(shape_stiffness_in, pack, lane, shape, along)
+        stiff_v = product(shape_stiffness_in, pack, lane, first_of_shape, v)
+        stiff_p = product(shape_stiffness_in, pack, lane, first_of_shape, p)
+        bent = product(shape_stiffness_in, pack, lane, first_of_shape, along)
         factor = hex_factor[hex]
         mu = body_mu_in[pack, body, lane]
         lam = body_lam_in[pack, body, lane]
@@ -342,12 +356,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             put(corner_out, pack, lane, first + wp.static(SIZE) * hex + i, force)
         put(corner_out, pack, lane, first + wp.static(SIZE) * hex, -total)
         if by_parameters:
-            mu_u, lam_u = by_constants(mode_mu, mode_lam, mode_ratio, shape, mu, lam, modes, u, along)
-            mu_v, lam_v = by_constants(mode_mu, mode_lam, mode_ratio, shape, mu, lam, modes, p, v)
-            mu_u += by_blocks(shape_mu, shape, corners, u, along)
-            mu_v += by_blocks(shape_mu, shape, corners, p, v)
-            lam_u += by_blocks(shape_lam, shape, corners, u, along)
-            lam_v += by_blocks(shape_lam, shape, corners, p, v)
+            lam_u = by_lam(shape_lam, mode_mu, mode_lam, mode_ratio, shape, mu, lam, modes, u, along)
+            lam_v = by_lam(shape_lam, mode_mu, mode_lam, mode_ratio, shape, mu, lam, modes, p, v)
+            mu_u = (dot(f, along) - lam * lam_u) / mu  # K is of first degree in mu and lam
+            mu_v = (work - lam * lam_v) / mu
             row = wp.static(ROWS) * hex
             parameter_out[pack, row, lane] = -factor * (h * mu_u + k * mu_v + real(2.0) * more)
             parameter_out[pack, row + 1, lane] = -factor * (h * lam_u + k * lam_v + more)
