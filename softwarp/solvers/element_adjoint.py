@@ -86,8 +86,8 @@ class TetAdjoint:
                 inputs += [w.body_mu.S, w.body_lam.S, stiffness.S, t.x.S, v.S, p.S, h]
                 s.each(k.tet_adjoint, -(-int(chosen.size) // per_item), inputs, [corner.S, self.parameter.S])
                 continue
-            sleeps = not parameters and LAWS[law].awake is not None
-            kernel = of_tets.kernels(s.variant, law, s.options.project_tangent, sleeps=sleeps).tet_adjoint
+            asked = parameters or LAWS[law].awake is None
+            kernel = of_tets.kernels(s.variant, law, s.options.project_tangent, asked).tet_adjoint
             inputs += [s.model.body_law_start, w.body_mu.real, w.body_lam.real, s.input["law_parameter"].real]
             inputs += [stiffness.real, t.x.real, v.real, p.real, h]
             s.each_real(kernel, chosen.size, inputs, [corner.real, self.parameter.real])

@@ -447,7 +447,7 @@ def projection(variant: Variant, law: str) -> SimpleNamespace:
 
 
 @single_worlds
-def kernels(variant: Variant, law: str, project: bool, *, sleeps: bool = False) -> SimpleNamespace:
+def kernels(variant: Variant, law: str, project: bool, by_parameters: bool = True) -> SimpleNamespace:
     """Gradients of tets of one law of ``laws.LAWS``.
 
     Where a tangent C has been projected, the gradient is that of the projection: with eigenvalues c_i and modes Q_i,
@@ -458,11 +458,11 @@ def kernels(variant: Variant, law: str, project: bool, *, sleeps: bool = False) 
         variant: Scalar type and memory order.
         law: Law.
         project: Whether the step has clamped tangents to positive semidefinite ones.
-        sleeps: Whether terms that the law leaves out have no gradients, where those by parameters are not asked for.
+        by_parameters: Whether gradients by parameters are asked for, which terms have that the law leaves out.
     """
     f = functions(variant)
-    real, mat33, awake = variant.real, f.mat33, None if sleeps else LAWS[law].awake
-    module = variant.module(f"adjoint.{law}.{'spd' if project else 'exact'}{'.asleep' if sleeps else ''}")
+    real, mat33, awake = variant.real, f.mat33, LAWS[law].awake if by_parameters else None
+    module = variant.module(f"adjoint.{law}.{'spd' if project else 'exact'}{'' if by_parameters else '.alone'}")
     decomposed, gradient_at, gradient_of, put_corners = f.decomposed, f.gradient_at, f.gradient_of, f.put_corners
     pull, parameters, count = contraction(variant, law, module).pull, law_parameters(real, law), LAWS[law].count
     spectrum = projection(variant, law)
