@@ -168,9 +168,6 @@ def _reduced(sim: Simulation) -> Iterator[str]:
             yield f"{told} beside {parts} with newton_iterations={count} yet; take newton_iterations=1"
     if model.joints is not None:
         yield f"{told} beside joints yet; take the full mesh"
-    if model.relaxes and sim.options.integrator != "euler":
-        parts = f"Maxwell branches with integrator {sim.options.integrator!r}"
-        yield f"{told} beside {parts} yet; take integrator='euler', or leave these out"
 
 
 def _rods(sim: Simulation) -> Iterator[str]:
