@@ -45,6 +45,10 @@ def require_static_gradient(sim: Simulation) -> None:
     if sim.model.reduction is not None:
         told = "equilibria of reduced bodies have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
+    if sim.model.hexes is not None:
+        name = sim.model.body_names[int(sim.model.hexes.layout.body[0])]
+        told = f"equilibria of hexahedra, those of body {name!r}, have no gradient yet"
+        raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
     if sim.model.membranes is not None:
         told = f"equilibria with membrane {sim.model.membranes.names[0]!r} have no gradient yet"
         raise ValueError(f"gradients.Equilibrium: {told}; take a Rollout with damping that comes to rest")
@@ -113,10 +117,6 @@ def _parts(model: Model) -> Iterator[str]:
     """Parts by name."""
     if model.body_count == 0 and not model.has_moving_frames:
         yield "a scene where nothing moves freely has nothing to differentiate; add a soft body, rod or rigid body"
-    if model.hexes is not None:
-        name = model.body_names[int(model.hexes.layout.body[0])]
-        told = f"hexahedra, those of body {name!r}, have no gradient yet"
-        yield f"{told}; mesh it with tetrahedra: add_tets(mesh.linear())"
     if model.frames is not None:
         yield from _frames(model, model.frames)
 
@@ -168,9 +168,6 @@ def _reduced(sim: Simulation) -> Iterator[str]:
             yield f"{told} beside {parts} with newton_iterations={count} yet; take newton_iterations=1"
     if model.joints is not None:
         yield f"{told} beside joints yet; take the full mesh"
-    if model.relaxes and sim.options.integrator != "euler":
-        parts = f"Maxwell branches with integrator {sim.options.integrator!r}"
-        yield f"{told} beside {parts} yet; take integrator='euler', or leave these out"
 
 
 def _rods(sim: Simulation) -> Iterator[str]:

@@ -73,7 +73,7 @@ class Rollout:
     once; worlds do not influence each other, so the gradient of a sum of losses of worlds is that of each.
 
     Args:
-        sim: Soft bodies of linear or quadratic tetrahedra, reduced or not, with cables and chambers, rods, rigid
+        sim: Soft bodies of tetrahedra, reduced or not, and hexahedra, with cables and chambers, rods, rigid
             bodies, and joints; steps of all integrators, with one linearisation per step or as many as solve it. Its
             ``dt`` and options are taken over now.
         rest: Make ``rest_x`` one of the parameters: gradients by the rest shape, for design.
@@ -88,10 +88,9 @@ class Rollout:
             raise TypeError(f"gradients.Rollout: sim must be a Simulation, got {checks.shown(sim)}")
         rest = checks.flag(rest, "gradients.Rollout: rest")
         require_differentiable(sim)
-        if rest and sim.model.reduction is not None:
-            raise ValueError(
-                "gradients.Rollout: rest shapes have no gradient beside reduced bodies; leave rest=True out"
-            )
+        if rest and (sim.model.reduction is not None or sim.model.hexes is not None):
+            beside = "hexahedra" if sim.model.reduction is None else "reduced bodies"
+            raise ValueError(f"gradients.Rollout: rest shapes have no gradient beside {beside}; leave rest=True out")
         self.worlds = DifferentiableWorlds(sim, rest=rest)
         self._rest = RestShape(sim.model, self.worlds.state["node_x"]) if rest else None
         self._markers = Markers(sim.model, self.worlds.state["node_x"])

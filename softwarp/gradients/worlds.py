@@ -270,6 +270,7 @@ class DifferentiableWorlds:
             self.model.has_moving_frames
             or self.model.relaxes
             or self.model.membranes is not None
+            or self.model.hexes is not None
             or self.model.reduction is not None
             or (self.model.contact is not None and self.model.contact.topology.has_embedded)
             or not self.solution_bytes

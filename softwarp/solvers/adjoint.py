@@ -20,6 +20,7 @@ from softwarp.solvers.cavity_adjoint import SurfaceAdjoint
 from softwarp.solvers.contact_adjoint import ContactAdjoint
 from softwarp.solvers.element_adjoint import QuadraticAdjoint, TetAdjoint
 from softwarp.solvers.frame_adjoint import FrameAdjoint
+from softwarp.solvers.hex_adjoint import HexAdjoint
 from softwarp.solvers.leaning_adjoint import Leaning, LeaningFrames
 from softwarp.solvers.membrane_adjoint import MembraneAdjoint
 from softwarp.solvers.mode_adjoint import ModeAdjoint
@@ -72,6 +73,7 @@ class StepAdjoint:
         self.element_v = self.row_v = self.node_v
         self.corner = s.rows(s.work.element_force.real.shape[1])
         self.tets = self.quadratic = self.skin = self.modes = None
+        self.hexes = HexAdjoint.of(s, system.terms)
         for term in system.terms:
             if isinstance(term, TetTerm):
                 self.tets = TetAdjoint(s, term.tets.tets, m.tet_count)
@@ -220,11 +222,7 @@ class StepAdjoint:
             term.start_over()
 
     def pull(self, *, parameters: bool = True) -> None:
-        """Gradients by the end of the step become those by its start; needs ``solve_again`` or a kept solution.
-
-        Args:
-            parameters: Whether those by parameters are asked for.
-        """
+        """Gradients by the step's end become those by its start; needs ``solve_again`` or a kept solution."""
         self._seed()
         self._find()
         self.to_commands()
@@ -269,11 +267,7 @@ class StepAdjoint:
             self._solve_known(self.delassus_known)
 
     def _seed(self, *, first: bool = True) -> None:
-        """Right-hand sides of p and q, which become 0.
-
-        Args:
-            first: Whether these are those of a step's end, and not of the way of an earlier solution.
-        """
+        """Right-hand sides of p and q, which become 0: ``first`` of a step's end, else of an earlier solution."""
         s, m, g = self.shard, self.model, self.gradients
         inputs = [self.h, s.lanes, m.dof_node, m.dof_free, g.node_x, g.node_v]
         s.each_real(self.k.seed, s.variant.parts(m.dof_count), inputs, [self.seed.real, self.system.linear.y.real])
@@ -477,6 +471,8 @@ class StepAdjoint:
         if self.quadratic is not None:
             self.quadratic.pull(*elements, parameters=parameters)
             self.quadratic.add_mass(self.p, self.node_mass_p)
+        if self.hexes is not None:
+            self.hexes.pull(*elements, parameters=parameters)
         if self.skin is not None and frames is None:
             self.skin.pull(*elements)
         if not m.row_count:
@@ -568,6 +564,8 @@ class StepAdjoint:
             self._to_moduli(x.body_tets, self.tets.parameter)
         if self.quadratic is not None:
             self._to_moduli(x.body_points, self.quadratic.points.parameter)
+        if self.hexes is not None:
+            self._to_moduli(x.body_hexes, self.hexes.parameter)
         if self.skin is not None:
             self.skin.to_parameters(self.h, g)
         inputs = [*scalars, m.node_count, m.node_body, x.node_heft, i["density"].real, self.node_p.real]

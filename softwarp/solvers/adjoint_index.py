@@ -20,6 +20,7 @@ class AdjointIndex:
         body_node_start: Ranges of nodes.
         body_tets: Ranges and indices of linear tets.
         body_points: Of Gauss points of quadratic ones.
+        body_hexes: Of hexahedra.
         law_count: Parameters of a body's law of its own.
         node_heft: Volume whose weight a node bears [m^3].
         node_point_start, node_point, node_point_weight: Points of rows.
@@ -30,6 +31,7 @@ class AdjointIndex:
     body_node_start: wp.array
     body_tets: tuple[wp.array, wp.array]
     body_points: tuple[wp.array, wp.array]
+    body_hexes: tuple[wp.array, wp.array]
     law_count: wp.array
     node_heft: wp.array
     node_point_start: wp.array
@@ -45,6 +47,7 @@ class AdjointIndex:
         tets = _by(model.tet_body.numpy(), model.body_count)
         quadratic, heft = model.quadratic, model.node_heft.numpy().copy()
         points = np.zeros(0, dtype=np.int64)
+        hexes = np.zeros(0, dtype=np.int32) if model.hexes is None else model.hexes.layout.body
         if quadratic is not None:
             points = quadratic.point_body.numpy()
             np.add.at(heft, quadratic.weight_node.numpy(), quadratic.weight_volume.numpy())
@@ -62,6 +65,7 @@ class AdjointIndex:
             body_node_start=send(model.body_node_start),
             body_tets=(send(tets[0]), send(tets[1])),
             body_points=tuple(send(part) for part in _by(points, model.body_count)),
+            body_hexes=tuple(send(part) for part in _by(hexes, model.body_count)),
             law_count=send([LAWS[law].own if law in LAWS else 0 for law in laws]),
             node_heft=send(heft, model.node_heft.dtype),
             node_point_start=send(point_start),

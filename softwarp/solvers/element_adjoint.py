@@ -18,6 +18,7 @@ from softwarp.kernels.elements import (
     volumetric_adjoint,
 )
 from softwarp.kernels.elements import adjoint as of_tets
+from softwarp.kernels.elements.laws import LAWS
 from softwarp.model.codes import TURNED
 from softwarp.model.quadratic import QuadraticModel
 from softwarp.solvers.terms.tets import TetArrays
@@ -85,7 +86,8 @@ class TetAdjoint:
                 inputs += [w.body_mu.S, w.body_lam.S, stiffness.S, t.x.S, v.S, p.S, h]
                 s.each(k.tet_adjoint, -(-int(chosen.size) // per_item), inputs, [corner.S, self.parameter.S])
                 continue
-            kernel = of_tets.kernels(s.variant, law, s.options.project_tangent).tet_adjoint
+            asked = parameters or LAWS[law].awake is None
+            kernel = of_tets.kernels(s.variant, law, s.options.project_tangent, asked).tet_adjoint
             inputs += [s.model.body_law_start, w.body_mu.real, w.body_lam.real, s.input["law_parameter"].real]
             inputs += [stiffness.real, t.x.real, v.real, p.real, h]
             s.each_real(kernel, chosen.size, inputs, [corner.real, self.parameter.real])

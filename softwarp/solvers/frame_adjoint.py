@@ -18,6 +18,7 @@ from softwarp.model.gradients import Gradients
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.system import System
 from softwarp.solvers.terms.attachments import AttachmentTerm
+from softwarp.solvers.terms.hexes import HexTerm
 from softwarp.solvers.workspace.rows import Rows
 
 
@@ -50,6 +51,7 @@ class FrameAdjoint:
         self.k_lever = lever_adjoint.kernels(shard.variant)
         self.count = len(model.segment_frames)
         self.attachments = next(term for term in system.terms if isinstance(term, AttachmentTerm))
+        self.hexes = next((term for term in system.terms if isinstance(term, HexTerm)), None)
         self.inertial_v = self.end_v = shard.work.dof_v
         self.pose = self.force_pose = shard.input["pose0"]
         self.twist0, self.internal = shard.input["twist0"], shard.work.node_internal
@@ -158,6 +160,8 @@ class FrameAdjoint:
                 kind, w.body_stiffness.S, kind.velocity if of_points else velocity, self.stiff
             )
         self.attachments.products.add_skin(w.body_stiffness.S, velocity, self.stiff)
+        if self.hexes is not None:
+            self.hexes.add_products(w.body_stiffness.S, velocity, self.stiff)
 
     def of_carried(self, index: AdjointIndex, p: Rows, q: Rows, node_bar: Rows) -> None:
         """What carried nodes have goes to their frames; they have no gradients of their own."""

@@ -37,7 +37,7 @@ LAYERS = (
     ("solvers.cavity_adjoint", "solvers.contact_adjoint", "solvers.element_adjoint", "solvers.newton_control"),
     ("solvers.frame_adjoint", "solvers.newton_contacts"),
     ("solvers.joint_sides",),
-    ("solvers.leaning_adjoint", "solvers.membrane_adjoint"),
+    ("solvers.leaning_adjoint", "solvers.membrane_adjoint", "solvers.hex_adjoint"),
     ("solvers.floating_adjoint",),
     ("solvers.mode_adjoint", "solvers.solution"),
     ("solvers.adjoint", "solvers.contact_directional"),

@@ -447,7 +447,7 @@ def projection(variant: Variant, law: str) -> SimpleNamespace:
 
 
 @single_worlds
-def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
+def kernels(variant: Variant, law: str, project: bool, by_parameters: bool = True) -> SimpleNamespace:
     """Gradients of tets of one law of ``laws.LAWS``.
 
     Where a tangent C has been projected, the gradient is that of the projection: with eigenvalues c_i and modes Q_i,
@@ -458,10 +458,11 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         variant: Scalar type and memory order.
         law: Law.
         project: Whether the step has clamped tangents to positive semidefinite ones.
+        by_parameters: Whether gradients by parameters are asked for, which terms have that the law leaves out.
     """
     f = functions(variant)
-    real, mat33 = variant.real, f.mat33
-    module = variant.module(f"adjoint.{law}.{'spd' if project else 'exact'}")
+    real, mat33, awake = variant.real, f.mat33, LAWS[law].awake if by_parameters else None
+    module = variant.module(f"adjoint.{law}.{'spd' if project else 'exact'}{'' if by_parameters else '.alone'}")
     decomposed, gradient_at, gradient_of, put_corners = f.decomposed, f.gradient_at, f.gradient_of, f.put_corners
     pull, parameters, count = contraction(variant, law, module).pull, law_parameters(real, law), LAWS[law].count
     spectrum = projection(variant, law)
@@ -495,6 +496,8 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         tet = tet_index[item]
         body = tet_body[tet]
         p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
+        if wp.static(awake is not None):
+            p = awake(p)
         F = gradient_of(node_x_in, pack, lane, tet_node, tet_gradient, tet)
         X = gradient_of(node_p_in, pack, lane, tet_node, tet_gradient, tet)
         Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)

@@ -20,14 +20,14 @@ import warp as wp
 from softwarp.kernels.algebra import single
 from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.kernels.elements.adjoint import contraction, functions, projection
-from softwarp.kernels.elements.laws import law_parameters
+from softwarp.kernels.elements.laws import LAWS, law_parameters
 
 
 @single_worlds
 def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
     """Directional derivatives of tets of one law of ``laws.LAWS``; arguments as of ``adjoint.kernels``."""
     f = functions(variant)
-    real, mat33 = variant.real, f.mat33
+    real, mat33, awake = variant.real, f.mat33, LAWS[law].awake
     module = variant.module(f"directional.{law}.{'spd' if project else 'exact'}")
     decomposed, gradient_at, gradient_of, put_corners = f.decomposed, f.gradient_at, f.gradient_of, f.put_corners
     pull, parameters = contraction(variant, law, module).pull, law_parameters(real, law)
@@ -162,6 +162,8 @@ def kernels(variant: Variant, law: str, project: bool) -> SimpleNamespace:
         changes = wp.dot(change, change) > real(0.0)
         if changes or more != real(0.0):
             p = parameters(body_law_start, body_mu_in, body_lam_in, law_parameter_in, pack, body, lane)
+            if wp.static(awake is not None):
+                p = awake(p)
             F = gradient_of(node_x_in, pack, lane, tet_node, tet_gradient, tet)
             Y = gradient_of(node_v_in, pack, lane, tet_node, tet_gradient, tet)
             k = body_stiffness_in[pack, body, lane]

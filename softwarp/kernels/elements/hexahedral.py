@@ -29,11 +29,13 @@ SAME = 1.0e-37  # Pa^2, square of a difference between moduli that are equal
 
 @cache
 def functions(variant: Variant) -> SimpleNamespace:
-    """How blocks are read and turned."""
+    """How blocks are read and turned, and how elements turn."""
     S = variant.S
     a = algebra(variant)
-    rows, read_vector = a.rows, a.read_vector
-    matmul, transposed = a.matmul, a.transposed
+    Matrix, rows, read_vector = a.Matrix, a.rows, a.read_vector
+    matmul, crossmul, transposed, row_x, row_y = a.matmul, a.crossmul, a.transposed, a.row_x, a.row_y
+    element_frame = corotational.functions(variant).element_frame
+    correction = warped.functions(variant).correction
 
     @wp.func
     def read_matrix(values: wp.array2d(dtype=S), w: int, row: int):
@@ -59,7 +61,20 @@ def functions(variant: Variant) -> SimpleNamespace:
         K = read_block(stiffness, w, hex_shape[code >> 6], (code >> 3) & 7, code & 7)
         return matmul(matmul(Q, K), transposed(Q))
 
-    return SimpleNamespace(read_matrix=read_matrix, turned_block=turned_block, read_block=read_block)
+    @wp.func
+    def nearest_rotation(F: Matrix):
+        """The rotation of the polar decomposition, from the axes of the first two columns as a start."""
+        columns = transposed(F)
+        Q = element_frame(row_x(columns), row_y(columns))
+        M = crossmul(Q, F)
+        for _ in range(wp.static(ITERATIONS)):
+            Q = matmul(Q, correction(M))
+            M = crossmul(Q, F)
+        return Q
+
+    return SimpleNamespace(
+        read_matrix=read_matrix, turned_block=turned_block, read_block=read_block, nearest_rotation=nearest_rotation
+    )
 
 
 @cache
@@ -70,15 +85,14 @@ def kernels(variant: Variant) -> SimpleNamespace:
     module = variant.module("hexahedral")
     a, f = algebra(variant), functions(variant)
     Vector, Matrix, Symmetric, rows = a.Vector, a.Matrix, a.Symmetric, a.rows
-    row_x, row_y, row_z, transposed, matmul, crossmul = a.row_x, a.row_y, a.row_z, a.transposed, a.matmul, a.crossmul
+    row_x, row_y, row_z, transposed, crossmul = a.row_x, a.row_y, a.row_z, a.transposed, a.crossmul
     add, subtract, scaled, cross, matvec, apply = a.add, a.subtract, a.scaled, a.cross, a.matvec, a.apply
     dot = a.dot
     read_vector, write_vector, add_vector, constant = a.read_vector, a.write_vector, a.add_vector, a.constant
     add_outer, add_matrix, write_matrix, combination = a.add_outer, a.add_matrix, a.write_matrix, a.combination
-    element_frame = corotational.functions(variant).element_frame
-    correction = warped.functions(variant).correction
     transformed = attachment.functions(variant).transformed
     read_matrix, read_block, turned_block = f.read_matrix, f.read_block, f.turned_block
+    nearest_rotation = f.nearest_rotation
 
     @wp.kernel(module=module, enable_backward=False)
     def shape_stiffness(
@@ -147,17 +161,6 @@ def kernels(variant: Variant) -> SimpleNamespace:
             d = subtract(read_vector(x, w, 3 * hex_node[hex, m]), origin)
             F = add_outer(F, d, constant(shape_gradient, shape, 3 * m))
         return F
-
-    @wp.func
-    def nearest_rotation(F: Matrix):
-        """The rotation of the polar decomposition, from the axes of the first two columns as a start."""
-        columns = transposed(F)
-        Q = element_frame(row_x(columns), row_y(columns))
-        M = crossmul(Q, F)
-        for _ in range(wp.static(ITERATIONS)):
-            Q = matmul(Q, correction(M))
-            M = crossmul(Q, F)
-        return Q
 
     @wp.func
     def balance(M: Matrix, t: Vector):

@@ -26,6 +26,8 @@ class Law:
         lanes: What has ``principal``, and ``slopes`` or ``invariants``, of eight elements at a time; without it they
             take turns.
         is_upright: Whether it has no stress where J is not positive; lanes then find its stretches in less time.
+        awake: Warp function ``awake(p)`` of a law that leaves terms out: ``p`` with which these are there, too small to
+            be seen, so that they have gradients.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Law:
     is_cubic: bool = False
     lanes: Any = None
     is_upright: bool = False
+    awake: Any = None
 
     @property
     def count(self) -> int:
@@ -113,6 +116,7 @@ LAWS = {
             slopes=m.ogden_slopes,
             lanes=ogden,
             is_upright=True,
+            awake=m.ogden_awake,
         ),
     )
 }

@@ -495,6 +495,16 @@ def power_strain(e: Any, alpha: Any, h: Any):
 
 
 @wp.func
+def ogden_awake(p: Any):
+    """The parameters with a modulus of 1e-30 Pa for each that is 0, whose term the functions below leave out."""
+    q = p
+    for term in range(3):
+        if p[2 * term + 1] == type(p[0])(0.0):
+            q[2 * term + 1] = type(p[0])(1.0e-30)
+    return q
+
+
+@wp.func
 def ogden_kirchhoff(e: Any, p: Any):
     """Principal Kirchhoff stresses s_i psi_i without the volumetric part."""
     t = e - e

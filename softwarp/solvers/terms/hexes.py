@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import warp as wp
+
 from softwarp.kernels.elements import hexahedral
 from softwarp.model.hexes import HexModel
 from softwarp.solvers.terms.term import Term
+from softwarp.solvers.workspace.rows import Rows
 from softwarp.solvers.workspace.shard import Shard
 
 
@@ -52,7 +55,11 @@ class HexTerm(Term):
         """Beta K v at carried nodes as internal forces; needs the velocities of slots."""
         if not moving and not (self.shard.leaning and inertia):
             return
+        self.add_products(self.shard.felt["beta"].S, self.shard.work.slot_v, self.shard.work.node_internal)
+
+    def add_products(self, factor: wp.array, velocity: Rows, out: Rows) -> None:
+        """Add a factor of every body times K v, as of the last ``forces``, at the nodes that frames carry."""
         s, m, w = self.shard, self.model, self.shard.work
         inputs = [hexahedral.CORNERS, m.hex_node, *self.elements, m.held_node, m.held_start, m.held_entry]
-        inputs += [s.felt["beta"].S, w.hex_stiffness.S, w.hex_rotation.S, w.slot_v.S]
-        s.each(self.k.held_damping, m.held_node.size, inputs, [w.node_internal.S])
+        inputs += [factor, w.hex_stiffness.S, w.hex_rotation.S, velocity.S]
+        s.each(self.k.held_damping, m.held_node.size, inputs, [out.S])

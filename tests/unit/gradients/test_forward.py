@@ -12,7 +12,7 @@ from softwarp.gradients import Rollout, States, jvp
 from tests.gradient_cases import CHANGES, STEPS, Inputs, cube, gradients, inputs, weights
 from tests.unit.gradients import test_contact as touching
 from tests.unit.gradients import test_touches as touches
-from tests.unit.gradients.test_adjoint import EXACT, GAS
+from tests.unit.gradients.test_adjoint import EXACT, GAS, difference
 
 AGREES = 1e-10  # of both modes in float64, relative to what may cancel in their product
 DIRECTIONS = 2
@@ -68,6 +68,25 @@ def test_both_modes_agree(law: str, strain: float) -> None:
     """With cables, a chamber with a rate and a locked axis; at the larger strain tangents are projected."""
     sim = cube(law)
     compare(Rollout(sim), inputs(sim, [1], strain), weights(sim))
+
+
+@pytest.mark.slow
+def test_terms_without_a_modulus() -> None:
+    """Ogden's law leaves them out; by their moduli there are gradients nevertheless, of both modes."""
+    sim = cube("ogden")
+    rollout, loss, given = Rollout(sim), weights(sim), inputs(sim, [1])
+    law = given["parameters"]["law_parameter"]
+    law[0, 3] = law[0, 5] = 0.0
+    found = gradients(rollout, given, loss)["parameters"]["law_parameter"]
+    for row in (3, 5):
+        change = torch.zeros_like(law)
+        change[0, row] = 1.0
+        expected = difference(rollout, given, loss, "parameters", "law_parameter", 10.0 * change) / 10.0
+        along = {"parameters": {"law_parameter": change[None]}}
+        slopes = jvp(rollout, along, given["state"], given["controls"], given["parameters"], steps=STEPS)[1]
+        slopes = replace(slopes, **{name: getattr(slopes, name)[0] for name in FIELDS})
+        assert abs(float(found[0, row]) - expected) <= 1e-6 * abs(expected)
+        assert abs(float(loss(slopes).sum()) - expected) <= 1e-6 * abs(expected)
 
 
 @pytest.mark.parametrize("law", ["nh_log", pytest.param("warped", marks=pytest.mark.slow)])
