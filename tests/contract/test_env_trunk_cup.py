@@ -108,16 +108,17 @@ def test_reward_counts_axis_as_way(env):
 
 
 def test_a_loose_grip_is_told():
-    """Nothing for a grasp of half a newton and more; its lack counts in shares of that, down to the weight."""
-    env = make(num_worlds=2, grip_weight=2.0, settle=False)
+    """Nothing for a grasp that is firm enough; what lacks counts in shares of ``firm_grip``, down to the weight."""
+    env = make(num_worlds=2, grip_weight=2.0, firm_grip=2.0, settle=False)
     env.reset()
     act(env, torch.zeros(2, CABLES))
-    none, told = torch.zeros(2), env.grip() > 0.5
+    none, told = torch.zeros(2), env.grip() > 2.0
     assert told.all() and torch.equal(env.reward_terms(none[:, None], none)["grip"], none)
     load = env.sim.contact_load
-    load *= torch.tensor([0.125, 0.0])[:, None, None] / env.grip()[:, None, None]
+    load *= torch.tensor([0.5, 0.0])[:, None, None] / env.grip()[:, None, None]
     torch.testing.assert_close(env.reward_terms(none[:, None], none)["grip"], torch.tensor([-1.5, -2.0]))
     assert env.reward_range == (-8.0, 1.0)
+    assert TrunkCupConfig().firm_grip == 0.5
 
 
 @pytest.mark.slow
@@ -194,6 +195,7 @@ def test_draws_of_mass_and_friction():
         ({"skin_corners": 3}, "skin_corners must be at least 4"),
         ({"alarm_distance": 0.0001}, "alarm_distance must be at least contact_distance"),
         ({"mu": -0.1}, "mu"),
+        ({"firm_grip": 0.0}, "firm_grip"),
         pytest.param({"mu": 0.0}, "the grasp does not hold this cup", marks=pytest.mark.slow),
     ],
 )

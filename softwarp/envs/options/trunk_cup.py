@@ -16,6 +16,7 @@ from softwarp.envs.options import (
     Pieces,
     Place,
     PoissonRatio,
+    Positive,
     PositiveRange,
     Rayleigh,
     check_choice,
@@ -85,7 +86,8 @@ class TrunkCupConfig(TrunkCupSceneConfig, CableReachConfig):
     axis_lever: Length = 0.0286  # m that a radian is worth: 10 degrees are 5 mm
     drop_distance: Length = 0.080  # m between cup and trunk from which the cup counts as dropped
     drop_penalty: NotNegative = 5.0  # taken from the reward of the action in which the cup is dropped
-    grip_weight: NotNegative = 0.0  # taken where the contacts' loads add up to nothing, less up to 0.5 N, then none
+    grip_weight: NotNegative = 0.0  # taken where the contacts' loads add up to nothing, less up to ``firm_grip``
+    firm_grip: Positive = 0.5  # N of all contacts, from which on nothing is taken; the cup weighs 0.024 N
     start_jitter: Distance = 0.003  # m, uniform in x and z, of the cup on the table, with start="open"
     carry_weight: NotNegative = 0.1  # with start="open": reward of an action at whose end the trunk carries the cup
     cup_mass_range: PositiveRange | None = None  # kg, drawn per world at reset

@@ -14,7 +14,7 @@ Goal         workspace: a pose in which the grasp was seen to hold the cup, its 
 Reward       shaped: progress (e_prev - e) / 10 mm, e = sqrt(d^2 + (28.6 mm * angle)^2);
              precision 1 / (1 + (e / 10 mm)^2);  effort -0.01 mean(a^2);  drop -5;  start="open": carry +0.1 of the
              share of the cup's weight that the trunk carries;  ``grip_weight``: grip, down to its negative where the
-             contacts' loads add up to less than 0.5 N
+             contacts' loads add up to less than ``firm_grip``
              paper:  |start - goal|_2 - |cup - goal|_1 in millimetres;  success +1
 Ends         terminated on a failed world, when the cup is dropped, and on success if ``end_on_success``; truncated
              after 250 actions (12.5 s)
@@ -365,7 +365,7 @@ class TrunkCup(CableReach):
         if self.is_open:
             terms["carry"] = config.carry_weight * self.carried()
         if config.grip_weight:
-            terms["grip"] = config.grip_weight * ((self.grip() / GRIP).clamp(max=1.0) - 1.0)
+            terms["grip"] = config.grip_weight * ((self.grip() / config.firm_grip).clamp(max=1.0) - 1.0)
         if self.action_size:
             terms["effort"] = config.effort_weight * rewards.effort(action.clamp(-1.0, 1.0))
         return terms
