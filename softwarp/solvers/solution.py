@@ -39,12 +39,13 @@ def solution_of(system: System) -> list[wp.array]:
 def half_sides(system: System) -> Rows | None:
     """Sides L^-1 H' of bounded rows that a solve leaves, in whose place an adjoint needs no A; None if it goes by A.
 
-    That is where A is shorter, where a GPU's blocks hold the sides elsewhere, where momentum of free bodies rests on
-    refinement, and where more than the one pass is asked for that brings forces anyway.
+    That is where A is shorter, on a GPU, where momentum of free bodies rests on refinement, and where more than the one
+    pass is asked for that brings forces anyway.
     """
     linear, m = system.linear, system.shard.model
     size = 3 * m.dof_count
-    if not isinstance(system.multipliers, BoundedMultipliers) or linear.panels is not None or system.free is not None:
+    is_bounded, on_gpu = isinstance(system.multipliers, BoundedMultipliers), system.shard.variant.world_fastest
+    if not is_bounded or on_gpu or system.free is not None:
         return None
     if system.options.refinement > 1 or m.row_count * size > system.shard.work.a.real.shape[1]:
         return None
