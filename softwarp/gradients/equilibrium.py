@@ -13,10 +13,10 @@ from softwarp.gradients.calls import highest_guard
 from softwarp.gradients.carried_equilibrium import AtRestTogether, CarriedWorlds
 from softwarp.gradients.frame_equilibrium import AtRest, FrameWorlds, after
 from softwarp.gradients.refusals import Diverged, require_static_gradient
+from softwarp.gradients.replayed import Replayed
 from softwarp.gradients.rest import RestShape
 from softwarp.gradients.rollout import Markers, fitted, tensors_of
 from softwarp.gradients.soft_equilibrium import Corrections
-from softwarp.gradients.worlds import Replayed
 from softwarp.model.gradients import COMMANDS, PARAMETERS, REST, Gradients
 from softwarp.model.state import create, worlds_slice
 from softwarp.simulation import Simulation

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 import torch
 import warp as wp
 
-from softwarp.gradients.worlds import OwnArrays, Replayed
+from softwarp.gradients.replayed import Replayed
+from softwarp.gradients.worlds import OwnArrays
 from softwarp.simulation import Simulation
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.frame_tangent import FrameTangent
