@@ -336,8 +336,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Key and force of one contact [N], in world axes, on side a, in ascending order of the keys; 0 past the last.
 
-        Only late contacts, past those that were listed first, are out of order. Where a late one has the key of a listed
-        one, whose rows have failed, this one receives the forces of both if they are to be joined.
+        Only late contacts, past those that were listed first, are out of order. Where a late one has the key of a
+        listed one, whose rows have failed, this one receives the forces of both if they are to be joined.
         """
         pack, c, lane = wp.tid()
         count = count_in[pack, 0, lane]
