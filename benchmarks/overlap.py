@@ -166,6 +166,10 @@ class VesselGauge:
 
     def __call__(self) -> Tensor:
         """Depth [m] of the deepest point in each world, 0 for a line that is clear of the wall, (world,)."""
+        return self.signed().clamp_min(0.0)
+
+    def signed(self) -> Tensor:
+        """The same, negative by the least distance from the wall where a line is clear of it, (world,)."""
         env = self.env
         line = env.sim.rod_x[:, env._nodes].to(torch.float32)
         line = line - env.sim.body_pose[:, env.scene.wall, None, :3].to(torch.float32)
@@ -173,7 +177,7 @@ class VesselGauge:
         place = 2.0 * (points - self.origin) / self.extent - 1.0
         grid = place[None, None]  # (1, 1, world, point, 3), trilinear as the wall itself
         found = torch.nn.functional.grid_sample(self.values, grid, padding_mode="border", align_corners=True)
-        return (-found[0, 0, 0]).amax(dim=1).clamp_min(0.0)
+        return (-found[0, 0, 0]).amax(dim=1)
 
 
 GAUGES: dict[str, Callable[[Any], Gauge | VesselGauge]] = {

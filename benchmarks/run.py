@@ -8,7 +8,8 @@
     softwarp bench PART ...                             # PART --help tells more about one of the others:
 
 PART is ``peers`` (other simulators on the same cantilever), ``start`` (cold start), ``contacts`` (many of them),
-``lift`` (a grasp), ``tubes`` (in a vessel), ``reduced`` (a quadruped in its modes), ``gradients`` (through motions),
+``lift`` (a grasp), ``tubes`` (in a vessel), ``walls`` (whether they come into its wall), ``reduced`` (a quadruped in
+its modes), ``gradients`` (through motions),
 ``adjoint`` (of steps), ``design``, ``searches``, ``first_order`` (all by gradients), ``episodes`` (whole ones, of
 robots that touch), ``laws`` (of solids), ``accuracy``, ``locking``, ``training``, ``ranks`` (that train together),
 ``rank_curves`` (what they learn), ``capture``, ``robustness``, ``soak``, ``view`` (pictures per second), ``fidelity``,
@@ -43,6 +44,7 @@ PARTS = (
     "contacts",
     "lift",
     "tubes",
+    "walls",
     "reduced",
     "gradients",
     "adjoint",

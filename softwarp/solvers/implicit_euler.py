@@ -170,9 +170,13 @@ class ImplicitEuler:
     def _improve(self, control: NewtonControl, iteration: int) -> None:
         """The next iterate."""
         system, h = self.system, self.h
+        part = self.swings[min(iteration, len(self.swings) - 1)] if self.swings else float("inf")
+        looks = system.multipliers.looks_ahead_of(system.work.dof_v, part)
         system.solve(h, h)
+        if looks:
+            system.peek(h)  # back from where they were taken
         if self.swings:
-            system.restrain(h, self.swings[min(iteration, len(self.swings) - 1)])
+            system.restrain(h, part)
         system.rotation_step(h)
         control.advance(h)
         self._evaluate(control, iteration + 1)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from softwarp.kernels.rows import cable, cable_block, delassus, held_sweeps
+from softwarp.kernels.rows import cable, cable_block, delassus, held_sweeps, looks
 from softwarp.model.codes import USUAL_SLOTS
 from softwarp.solvers.collision import contact_list
 from softwarp.solvers.linear.cholesky import LinearSolver
@@ -103,6 +103,13 @@ class Multipliers:
         """Whether there are rows at all."""
         return self.rows.count > 0 or bool(self.contact_forces)
 
+    def looks_ahead_of(self, velocities: Rows, part: float) -> bool:
+        """Whether the next solve, which corrects ``velocities``, looks at contacts where it leads to.
+
+        ``part`` of what swings a line too far for a linearisation is what it may go, as of ``System.restrain``.
+        """
+        return False
+
     def add_forces(self, target: Rows, f_scale: float) -> None:
         """target += f_scale H' multiplier of all rows."""
         self.rows.add_forces(target, f_scale)
@@ -163,6 +170,7 @@ class ContactMultipliers(Multipliers):
         contact: Contacts, if the scene has any.
         unbounded: Static rows that are eliminated.
         peek: Trial positions of what contacts look at, after a factor times the velocities.
+        measure_way: How much of the unknowns' way worlds go, in one of several Newton iterations.
 
     Attributes:
         guess: Velocities of the dofs that a linear solve corrects, where they are not 0.
@@ -174,16 +182,21 @@ class ContactMultipliers(Multipliers):
         contact: ContactTerm | None,
         unbounded: Sequence[int],
         peek: Callable[[float], None],
+        measure_way: Callable[[float, float], None],
     ) -> None:
         super().__init__(rows_)
-        s, w = self.shard, self.shard.work
-        self.contact, self.peek = contact, peek
+        s, w, o = self.shard, self.shard.work, self.shard.options
+        self.contact, self.peek, self.measure_way = contact, peek, measure_way
+        self.is_iterated, self.part = o.newton_iterations > 1, 1.0
+        self.k_looks = looks.kernels(s.variant)
         self.guess: Rows | None = None
         contacts = contact_list.allocate(s.variant, s.world_count, 0, s.device)
         if contact is not None:
             contacts = contact.contacts
             self.overflow, self.contact_forces = contacts.overflow, (contacts.multiplier,)
-            self.corrections = s.options.contact_passes if s.options.newton_iterations == 1 else 0
+            self.corrections = o.iterated_passes if self.is_iterated else o.contact_passes
+            if self.corrections and self.is_iterated:
+                self.guess = s.rows(s.dof_room)
         further = s.options.further_passes if self.corrections else 0
         self.laws = ContactResponse(
             s.model.symbolic,
@@ -205,6 +218,14 @@ class ContactMultipliers(Multipliers):
         self.response = self.laws
         if contact is not None and further:
             self.further = FurtherLooks(s, contact, self.laws, self.linear.panels)
+
+    def looks_ahead_of(self, velocities: Rows, part: float) -> bool:
+        """Keep what the next solve corrects, if it looks at contacts where both lead to."""
+        if self.guess is None or not self.is_iterated or not self.corrections:
+            return False
+        self.guess.copy_from(velocities)
+        self.part = part
+        return True
 
     def add_forces(self, target: Rows, f_scale: float) -> None:
         """target += f_scale H' multiplier of all rows."""
@@ -267,9 +288,15 @@ class ContactMultipliers(Multipliers):
         """Distances of the contacts where the unknowns of the last pass lead to; new ones join the response."""
         assert self.contact is not None
         s, w = self.shard, self.shard.work
-        s.add(w.u, w.dof_v, s.dof_rows)
+        if self.is_iterated:
+            self.measure_way(x_scale, self.part)
+            s.each_real(self.k_looks.go_part, s.dof_rows, [w.share_of_way.real, w.u.real], [w.dof_v.real])
+        else:
+            s.add(w.u, w.dof_v, s.dof_rows)
         self.peek(x_scale)
         end = self.contact.look(x_scale, again=again)
+        if self.is_iterated:
+            s.each_real(self.k_looks.extend, self.contact.model.capacity, [w.share_of_way.real], [end.real])
         if self.guess is None:
             w.dof_v.zero()
         else:

@@ -24,6 +24,7 @@ class Options:
         newton_tolerance: Relative force imbalance that ends the iterations.
         refinement: Passes of iterative refinement of every linear solve.
         contact_passes: Times that contacts are measured anew where the step leads to, with one Newton iteration.
+        iterated_passes: The same in each of several Newton iterations.
         further_passes: Times that they are beyond these, in worlds that the last time has moved by more than ``skin``.
         skin: Way [m] up to which what a correction moves needs no further look.
         most_swing: Turn or stretch [rad] of a segment of a telescope in a step of one Newton iteration, beyond which
@@ -48,6 +49,7 @@ class Options:
     newton_tolerance: Annotated[float, Range(above=0.0, high=1.0)] = 1e-3
     refinement: Annotated[int, Range(low=0, high=100)] = 1
     contact_passes: Annotated[int, Range(low=0, high=100)] = 1
+    iterated_passes: Annotated[int, Range(low=0, high=100)] = 0
     further_passes: Annotated[int, Range(low=0, high=100)] = 0
     skin: Annotated[float, Range(low=0.0)] = 0.0
     most_swing: Annotated[float, Range(above=0.0, infinite=True)] = 0.5

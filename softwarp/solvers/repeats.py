@@ -30,6 +30,7 @@ SWING = 0.5  # rad, that an iteration may swing a line by
 FREE, LESS = 8, 0.7  # iterations that may do so in full, and what each further one may of the one before: some end in
 # two sets of contacts that lead to each other
 SWINGS = (*[1.0] * FREE, *(LESS**k for k in range(1, ITERATIONS - FREE + 1)))
+LOOKS = 1  # of an iteration at contacts where it leads to: along the plane of a curved wall a line slides into it
 TOLERANCE = 1e-3  # relative force imbalance that ends them
 DEEP = 0.5  # radii of a line that an iterate may lie in what it touches at no cost to its merit
 SWEEPS = 25  # over contacts in an iteration, at most, from the forces of the one before: a GPU waits for all of them
@@ -186,7 +187,8 @@ def repeats_steps(model: Model, options: Options) -> bool:
 def twin_options(options: Options, precision: str) -> Options:
     """Options of the steps that are repeated: more iterations, and what penetrates is taken back whole.
 
-    In float64 an iteration solves once: the next one corrects it. In float32 it cannot measure what that leaves.
+    In float64 an iteration solves once, and once more for what it comes to touch: the next one corrects what is left.
+    In float32 it cannot measure what that leaves, so its pass of refinement, in which it looks at contacts too, stays.
     """
     return replace(
         options,
@@ -195,6 +197,7 @@ def twin_options(options: Options, precision: str) -> Options:
         newton_tolerance=TOLERANCE,
         gauss_seidel_iterations=min(SWEEPS, options.gauss_seidel_iterations),
         most_swing=SWING,
+        iterated_passes=LOOKS,
         further_passes=0,
         recovery_time=0.0,
         repeat_swing=float("inf"),

@@ -99,7 +99,7 @@ class System:
 
     def _make_multipliers(self) -> Multipliers:
         if any(term.responds for term in self.terms):
-            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.peek)
+            return ContactMultipliers(self.rows, self.contact, self.unbounded, self.peek, self.measure_way)
         return BoundedMultipliers(self.rows) if self.rows.count else Multipliers(self.rows)
 
     @property
@@ -374,6 +374,12 @@ class System:
             s.add(linear.y, w.u, s.dof_rows)
         if self.watch is not None:
             self.watch(correction)
+
+    def measure_way(self, h: float, part: float) -> None:
+        """How much of the unknowns' way ``restrain`` would let worlds go."""
+        self.work.share_of_way.fill(1.0)
+        for term in self.terms:
+            term.measure_way(h, part)
 
     def restrain(self, h: float, part: float = 1.0) -> None:
         """Let the unknowns of a single linearisation go no farther than it holds, or a part of that."""

@@ -11,6 +11,7 @@ import torch
 import softwarp as sw
 from softwarp import Tube, TubeSection
 from softwarp.shapes import Vessel
+from softwarp.solvers import repeats
 
 RADIUS = 0.0065  # m, of a channel
 PUSH = 0.002  # m a step
@@ -60,6 +61,40 @@ def test_steps_taken_again_leave_a_wire_that_crumples_inside() -> None:
     """The same, without another limit: its middle is never nearer to the wall than three quarters of its radius."""
     way, clear, status = push(math.inf, 60, 0.05)
     assert way < 0.006 and clear > 0.75e-3 and status == sw.Status.OK
+
+
+def slid(monkeypatch: pytest.MonkeyPatch, looks: int) -> tuple[float, float]:
+    """Least clearance of a wire that its tip is pulled round a vessel's wall with [m], and how far round [rad]."""
+    monkeypatch.setattr(repeats, "LOOKS", looks)
+    builder = sw.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    line = np.array([(0.0, 0.0, z) for z in (-0.02, 0.04, 0.12)])
+    vessel = Vessel.from_tubes([(line, 0.006)], 1e-3, wall=0.02)
+    wire = Tube([TubeSection(0.1)], radius=9e-4, youngs=1e7, density=1550.0)
+    telescope = builder.add_telescope(
+        [wire], segments=8, lengths=(0.08,), windup=False, rayleigh=(0.1, 0.02), contact_radius=1e-3
+    )
+    builder.add_contact(telescope, builder.add_rigid(vessel, kinematic=True), mu=0.1)
+    sim = sw.Simulation(builder.finalize(precision="float64"), dt=0.01, repeat_swing=0.05, solver_path="scalar")
+    clear = math.inf
+    for step in range(10):
+        sim.control.rod_force[0, -1, 0] = 0.0 if step < 5 else 0.02
+        sim.control.rod_force[0, -1, 1] = -0.01 if step < 5 else 0.0
+        sim.step()
+        assert sim.status[0] == sw.Status.OK
+        clear = min(clear, float(vessel.clearance(sim.rod_x[0, 1:].numpy()).min()))
+    x, y = sim.rod_x[0, -1, :2].tolist()
+    return clear, math.atan2(y, x) + 0.5 * math.pi
+
+
+def test_a_wire_slides_round_a_wall_that_curves_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thrown to a lumen's next side, a quarter turn, it is nowhere deeper in its wall than a hundredth of its radius.
+
+    Planes of contacts let it slide on into the wall; without looks there iterates end 0.15 of the radius deep.
+    """
+    clear, turn = slid(monkeypatch, repeats.LOOKS)
+    assert clear > 0.99e-3 and 1.0 < turn < 2.2
+    clear, _ = slid(monkeypatch, 0)
+    assert clear < 0.9e-3
 
 
 def stretched(repeat_swing: float) -> float:

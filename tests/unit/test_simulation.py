@@ -60,7 +60,7 @@ def test_exact_systems_are_refused_where_the_tangent_is_not_known():
 
 
 BY_SCENE = {"further_passes", "skin"}  # chosen where contact_passes is not given
-INSIDE = {"gpu_path", "turning_tangent"}  # for tests and statics
+INSIDE = {"gpu_path", "turning_tangent", "iterated_passes"}  # for tests, statics and steps that are taken again
 GIVEN = {
     "integrator": "bdf2",
     "newton_iterations": 3,

@@ -322,6 +322,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def remember(
+        joins: bool,
         # Workspace in
         listed_in: wp.array3d(dtype=wp.int32),
         count_in: wp.array3d(dtype=wp.int32),
@@ -335,7 +336,8 @@ def kernels(variant: Variant) -> SimpleNamespace:
     ):
         """Key and force of one contact [N], in world axes, on side a, in ascending order of the keys; 0 past the last.
 
-        Only late contacts, past those that were listed first, are out of order.
+        Only late contacts, past those that were listed first, are out of order. Where a late one has the key of a
+        listed one, whose rows have failed, this one receives the forces of both if they are to be joined.
         """
         pack, c, lane = wp.tid()
         count = count_in[pack, 0, lane]
@@ -348,6 +350,12 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if c < count:
                 for axis in range(3):
                     force += multiplier_in[pack, 3 * c + axis, lane] * axes_in[pack, 9 * c + 3 * axis + i, lane]
+                if joins:
+                    for other in range(wp.max(listed_in[pack, 0, lane], c + 1), count):
+                        if key_in[pack, other, lane] == key_in[pack, c, lane]:
+                            for axis in range(3):
+                                entry = 9 * other + 3 * axis + i
+                                force += multiplier_in[pack, 3 * other + axis, lane] * axes_in[pack, entry, lane]
             known_force_out[pack, 3 * place + i, lane] = force
 
     @wp.kernel(module=module, enable_backward=False)

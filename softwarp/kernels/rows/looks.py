@@ -11,6 +11,7 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 SWEPT = 0.01  # of the skin, what the last sweep over the contacts may have corrected where they are solved
+LEAST_PART = 1.0e-3  # of a way, below which distances at its end are those of that much
 NONE = 1 << 30  # first contact of a world that has none to be worked on
 
 
@@ -86,6 +87,30 @@ def kernels(variant: Variant) -> SimpleNamespace:
             idle_out[pack, 0, lane] = 1
 
     @wp.kernel(module=module, enable_backward=False)
+    def go_part(
+        # Workspace in
+        share_in: wp.array3d(dtype=real),
+        u_in: wp.array3d(dtype=real),
+        # Workspace out
+        v_out: wp.array3d(dtype=real),
+    ):
+        """Velocities receive the part of the unknowns that a world goes."""
+        pack, row, lane = wp.tid()
+        v_out[pack, row, lane] = v_out[pack, row, lane] + share_in[pack, 0, lane] * u_in[pack, row, lane]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def extend(
+        # Workspace in
+        share_in: wp.array3d(dtype=real),
+        # Workspace out
+        end_out: wp.array3d(dtype=real),
+    ):
+        """Distance at the end of the whole way for which that at the end of the part is 0, linear in the way."""
+        pack, contact, lane = wp.tid()
+        share = wp.max(share_in[pack, 0, lane], real(wp.static(LEAST_PART)))
+        end_out[pack, contact, lane] = end_out[pack, contact, lane] / share
+
+    @wp.kernel(module=module, enable_backward=False)
     def quiet(
         # Workspace in
         idle_in: wp.array3d(dtype=wp.int32),
@@ -115,4 +140,4 @@ def kernels(variant: Variant) -> SimpleNamespace:
         if idle_in[pack, 0, lane] != 0:
             now_out[pack, row, lane] = before_in[pack, row, lane]
 
-    return SimpleNamespace(pack_count=pack_count, watch=watch, quiet=quiet, hold=hold)
+    return SimpleNamespace(pack_count=pack_count, watch=watch, go_part=go_part, extend=extend, quiet=quiet, hold=hold)

@@ -471,14 +471,15 @@ class Detector:
 
     # Memory
 
-    def remember(self, *, notes: bool = False) -> None:
+    def remember(self, *, notes: bool = False, joins: bool = False) -> None:
         """Take the forces of ``contacts`` as the first guess of the next ``find``.
 
         Args:
             notes: Whether to note what has pressed, too, which that keeps.
+            joins: Whether a contact that was found late once more leaves both forces; else that of the first.
         """
         c = self.contacts
-        inputs = [c.listed.real, c.count.real, c.key.real, c.axes.real, c.multiplier.real]
+        inputs = [joins, c.listed.real, c.count.real, c.key.real, c.axes.real, c.multiplier.real]
         outputs = [self.known_count.real, self.known_key.real, self.known_force.real]
         self._launch(self.k_list.remember, self.capacity, inputs, outputs)
         if notes and self.k_keep is not None:

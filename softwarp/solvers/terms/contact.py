@@ -84,7 +84,7 @@ class ContactTerm(Term):
         """Contacts at the trial positions."""
         s = self.shard
         if moving:
-            self.detector.remember(notes=keeps)
+            self.detector.remember(notes=keeps, joins=s.options.iterated_passes > 0)
         if s.options.newton_iterations == 1:  # more iterations look again where the bodies have come to
             self.detector.slack = MARGIN * look * look * self.gravity if falling else 0.0
         self.detector.find(s.work.x, s.work.pose, s.input["v0"], s.input["twist0"], look, self.pairs, keeps=keeps)

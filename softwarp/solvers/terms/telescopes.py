@@ -139,11 +139,9 @@ class TelescopeTerm(Term):
         inputs = [m.base_frame, m.base_dof, m.port, w.base_angle.real, s.input["pose0"].real, h]
         s.each_real(self.k.drive, m.count, inputs, [w.prescribed_v.real])
 
-    def restrain(self, h: float, part: float) -> None:
-        """Worlds whose lines swing more than a linearisation holds go a part of their way; no segment turns over."""
+    def measure_way(self, h: float, part: float) -> None:
+        """Part of their way in which no segment of a line swings by more than a linearisation holds."""
         s, w, m, f, most = self.shard, self.shard.work, self.model, self.frames, part * self.shard.options.most_swing
-        if math.isinf(most) and math.isinf(s.options.repeat_swing):
-            return
         k, found = self.k_restraint, [w.share_of_way.real, w.swing.real]
         inputs = [m.pieces, m.base_frame, f.frame_dof, self.radius, w.telescope_plan.real, w.u.real]
         if s.variant.world_fastest:
@@ -152,8 +150,15 @@ class TelescopeTerm(Term):
             s.each_real(k.share_of_segments, None, [most, m.piece_count, w.segment_swing.real], found)
         else:
             s.each_real(k.share_of_way, None, [h, most, *inputs], found)
+
+    def restrain(self, h: float, part: float) -> None:
+        """Worlds whose lines swing more than a linearisation holds go a part of their way; no segment turns over."""
+        s, w, m, f, k = self.shard, self.shard.work, self.model, self.frames, self.k_restraint
+        if math.isinf(s.options.most_swing) and math.isinf(s.options.repeat_swing):
+            return
+        self.measure_way(h, part)
         inputs = [s.model.dof_free, w.share_of_way.real]
-        s.each_real(self.k_restraint.hold_back, s.variant.parts(s.model.dof_count), inputs, [w.u.real])
+        s.each_real(k.hold_back, s.variant.parts(s.model.dof_count), inputs, [w.u.real])
         linear = s.options.newton_iterations == 1  # looks at contacts have moved the poses since
         inputs = [h, m.pieces, m.base_frame, f.frame_dof, s.model.dof_free]
         s.each_real(k.hold_turns, None, [*inputs, s.input["pose0"].real if linear else w.pose.real], [w.u.real])

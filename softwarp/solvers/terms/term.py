@@ -143,6 +143,9 @@ class Term:
         Trial positions may be those where that pass led to.
         """
 
+    def measure_way(self, h: float, part: float) -> None:
+        """How much of their way ``restrain`` would let worlds go, into ``share_of_way``."""
+
     def restrain(self, h: float, part: float) -> None:
         """Shorten the unknowns of a linearisation in worlds that they lead farther than it holds, or a part of that."""
 
