@@ -63,7 +63,9 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
     return [
         (name, value)
         for name, value in found
-        if value.__module__ == module.__name__ and {"variant", "real"} & set(inspect.signature(value).parameters)
+        if value.__module__ == module.__name__
+        and {"variant", "real"} & set(inspect.signature(value).parameters)
+        and not inspect.isgeneratorfunction(inspect.unwrap(value))  # which a context manager is
     ]
 
 
