@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from softwarp.envs import registry
@@ -110,7 +109,7 @@ class Watch:
     def act(self, action: Tensor) -> None:
         """Take an action in all worlds."""
         self.deepest.fill_(-np.inf)
-        after = self.env.step(TensorDict({"action": action}, batch_size=self.env.batch_size))["next"]
+        after = self.env.step(self.env.full_action_spec.zero().set("action", action))["next"]
         tally = self.tally
         tally.failed += int((after["world_status"] >= int(Status.NONFINITE)).sum())
         tally.actions_inside += bool((self.gauge.signed() > 0.0).any())

@@ -42,8 +42,9 @@ COMPILED: set[wp.Kernel] = set()  # found in PTX; a later factory may bring some
 
 
 LONG = {
-    *("collision.surface_phase", "elements.quadratic", "frames.gyration", "frames.inertia", "frames.momentum"),
-    *("elements.turning", "frames.windup", "rows.touch_adjoint", "rows.touch_directional"),
+    *("collision.keeping", "collision.surface_phase", "elements.quadratic", "elements.turning"),
+    *("frames.gyration", "frames.gyration_adjoint", "frames.inertia", "frames.momentum", "frames.windup"),
+    *("rows.touch_adjoint", "rows.touch_directional", "rows.touch_gather"),
     *("inverse.laws", "inverse.program", "inverse.settling"),
 }
 
@@ -71,10 +72,8 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
 
 def is_slow(module: str, choice: dict[str, Any]) -> bool:
     """Whether others that compile in less time show as much, as they are written in the same way."""
-    if choice.get("near_unknowns"):  # stand where rows stand otherwise
-        choice = choice | {"near_rows": 104}
     usual = {"law": "neo_hookean", "own_contacts": 1, "near_rows": 104, "project": True}
-    usual |= {"by_parameters": True, "is_large": False, "together": True, "varying": False}
+    usual |= {"by_parameters": True, "is_large": False, "together": True, "varying": False, "near_unknowns": 0}
     return module.removeprefix("kernels.") in LONG or any(
         choice.get(key, value) != value for key, value in usual.items()
     )
