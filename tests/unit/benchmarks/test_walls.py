@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from benchmarks import walls
 from softwarp.shapes import Vessel
@@ -28,8 +29,8 @@ def env() -> SimpleNamespace:
 
     sim.step = step
     scene, config = SimpleNamespace(vessel=vessel, wall=0), SimpleNamespace(contact_radius=0.001)
-    parts = {"scene": scene, "sim": sim, "config": config, "device": torch.device("cpu"), "batch_size": [2]}
-    return SimpleNamespace(**parts, num_worlds=2, _nodes=slice(0, 5), step=act)
+    parts = {"scene": scene, "sim": sim, "config": config, "full_action_spec": SimpleNamespace(zero=TensorDict)}
+    return SimpleNamespace(**parts, num_worlds=2, device=torch.device("cpu"), _nodes=slice(0, 5), step=act)
 
 
 def test_steps_in_the_wall_are_counted(env: SimpleNamespace) -> None:

@@ -51,15 +51,15 @@ def test_terms_override_stages_only() -> None:
     """A public method of a term is a stage of ``Term`` with the same arguments.
 
     Contact also tells where it ends, and finds again what was there with the forces of an earlier iterate; adjoints
-    ask for the stiffness of membranes, what dofs feel of memories, where modes put nodes, and how chosen elements are
-    placed and what they do.
+    ask for the stiffness of membranes, products with that of hexahedra, what dofs feel of memories, where modes put
+    nodes, and how chosen elements are placed and what they do.
     """
     stages = {name for name, value in vars(Term).items() if not name.startswith("_") and inspect.isfunction(value)}
     kinds = [kind for kind in vars(table).values() if inspect.isclass(kind) and issubclass(kind, Term)]
     assert len(kinds) > 8
     for kind in kinds:
         own = {name for name, value in vars(kind).items() if not name.startswith("_") and inspect.isfunction(value)}
-        others = {"look", "find_kept", "stiffness", "lean_dofs", "place_both", "sample", "take_samples"}
+        others = {"look", "find_kept", "stiffness", "lean_dofs", "place_both", "sample", "take_samples", "add_products"}
         assert own - stages <= others, kind.__name__
         for name in own & stages:
             assert (
