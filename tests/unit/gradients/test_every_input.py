@@ -284,6 +284,8 @@ def test_gradients_are_those_of_differences(scene: str) -> None:
     """By all that the scene has; what touches is pressed."""
     sim = SCENES[scene]()
     given, sizes = given_of(sim)
+    if "touching" not in scene and "body_mass" in sizes["parameters"]:
+        sizes["parameters"]["body_mass"] *= 10.0  # bodies of some grams, to which a loss of 75 owes its last digits
     check(Rollout(sim), given, loss, sizes)
     assert "touching" not in scene or modes(sim, given) & {STUCK, SLIPPING}
 
