@@ -14,6 +14,8 @@ from softwarp.threads import Workers
 class Replayed:
     """Launches that are recorded at their second call and replayed from then on, those of shards side by side.
 
+    A recording knows addresses alone, so the launches, and with them what they read and write, stay alive beside it.
+
     Args:
         device: Warp device.
         launches: One function a shard.
@@ -43,7 +45,6 @@ class Replayed:
                 self._is_compiled = True
                 return
             self._graphs = [self._record(launch) for launch in self._launches]
-            self._launches = ()
         with interop.replaying(self._device):
             if self._workers is None:
                 for graph in self._graphs:
