@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from softwarp import advice
+from softwarp import advice, checks
 from softwarp.envs import registry
-from softwarp.identification.fitting import METHODS
+from softwarp.identification.fitting import METHODS, MOST_SAMPLES
 from softwarp.io.atomic import prove_writable, write_text
 
 CASES = {  # module of this folder with ``identify(extra, **options) -> Fit``
@@ -52,13 +52,13 @@ def main(arguments: Sequence[str]) -> int:
         raise ValueError(f"there is no case {args.case!r}; {advice.nearest(args.case, CASES)}")
     if args.json and args.json != "-":
         prove_writable(args.json)
-    options: dict[str, Any] = {"method": args.method, "seed": args.seed}
+    options: dict[str, Any] = {"method": args.method, "seed": checks.seed(args.seed, "--seed")}
     if args.devices is not None:
         if args.case not in ON_DEVICES:
             raise ValueError(f"--devices: {args.case} settles on a CPU only; {', '.join(ON_DEVICES)} takes them")
         options["devices"] = [registry.check_device(device) for device in args.devices]
     if args.samples is not None:
-        options["samples"] = args.samples
+        options["samples"] = checks.count(args.samples, "--samples", low=0, high=MOST_SAMPLES)
     found = importlib.import_module(f".{CASES[args.case]}", __package__).identify(args.measured, **options)
     text = json.dumps(found.as_dict(), indent=1)
     print(text if args.json == "-" else found.table())

@@ -73,13 +73,17 @@ def _environment(config: ReduceConfig, options: dict[str, Any], worlds: int, see
 
 def _body(sim: Simulation, name: str) -> int:
     """Number of the body to reduce: the one of that name, or that of the most elements."""
-    names = sim.model.body_names
+    names, hexes = sim.model.body_names, sim.model.hexes
+    bricks = set() if hexes is None else {names[body] for body in np.unique(hexes.layout.body)}
     if name:
         if name not in names:
             raise ValueError(f"body={name}: there is no such soft body; the scene has {', '.join(names)}")
+        if name in bricks:
+            raise ValueError(f"body={name}: it has hexahedra, which cannot be reduced yet; take tetrahedra")
         return names.index(name)
-    if not names:
-        raise ValueError("the scene has no soft body that could be reduced")
+    if bricks.issuperset(names):
+        told = f": {', '.join(names)} has hexahedra, which cannot be reduced yet; take tetrahedra" if names else ""
+        raise ValueError(f"the scene has no soft body that could be reduced{told}")
     quadratic = sim.model.quadratic
     of_points = np.empty(0, dtype=np.int64) if quadratic is None else np.repeat(quadratic.layout.body, POINTS)
     return int(np.bincount(np.concatenate([sim.model.tet_body.numpy(), of_points])).argmax())

@@ -36,8 +36,8 @@ class Bricks:
         """Add a soft body of hexahedra with incompatible modes, which bend and do not lock near nu = 0.5.
 
         One brick through the thickness of a plate or leg bends as a beam does. Everything that takes a soft body takes
-        this one; on its boundary every quadrilateral counts as two triangles. Gradients and reductions do not know
-        hexahedra yet.
+        this one; on its boundary every quadrilateral counts as two triangles. Reductions, natural modes, and gradients
+        of equilibria and by rest shapes do not know hexahedra yet.
 
         Args:
             nodes: Rest positions [m], shape (n, 3), or a ``HexMesh`` (``meshing.brick``).

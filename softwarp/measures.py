@@ -177,6 +177,11 @@ class Measures:
         diagnostics.refuse_frames(self.model, "modes")
         if self.model.cable_elastic.any():
             raise ValueError("modes: cables that stretch are not known; leave their stiffness out")
+        if not self._systems[0].has_exact_tangent:
+            raise ValueError(
+                "modes: soft bodies of tetrahedra, cables and chambers are known; this scene has other parts, build "
+                "one without them (mesh hexahedra with add_tets(mesh.linear()))"
+            )
         systems = self.make_systems(0, exact=True)
         worlds, system = next(part for part in systems if part[0].start <= world < part[0].stop)
         rayleigh = (self._parameters.rayleigh_mass.numpy()[world], self._parameters.rayleigh_stiffness.numpy()[world])

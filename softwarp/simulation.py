@@ -14,7 +14,7 @@ from softwarp.measures import Measures
 from softwarp.model import memory
 from softwarp.model.model import Model
 from softwarp.model.state import Control, Parameters, State, create, create_parameters, worlds_slice
-from softwarp.scene import Handle, SoftBody
+from softwarp.scene import Handle
 from softwarp.snapshot import Snapshot
 from softwarp.solvers.footprint import require_room, with_room
 from softwarp.solvers.linear.cholesky import upload
@@ -400,12 +400,11 @@ class Simulation(
         """Force that part b exerted on part a in the last step, summed over their contacts [N], shape (world, 3).
 
         Raises:
-            ValueError: If the parts are no contact pair.
+            ValueError: If the parts are no contact pair. A plain index means a soft body.
         """
         if self.model.contact is None:
             raise ValueError("the scene has no contact pairs; use ModelBuilder.add_contact")
-        parts = [part if isinstance(part, Handle) else SoftBody(part) for part in (a, b)]
-        pair, sign = self.model.contact.find(parts[0], parts[1])
+        pair, sign = self.model.contact.find(a, b)
         force: torch.Tensor = sign * self._views["pair_force"][:, pair]
         return force
 

@@ -82,7 +82,7 @@ def fit(
         seed: Of samples and evolution.
 
     Raises:
-        TypeError: If ``residuals`` cannot be called.
+        TypeError: If ``residuals`` or ``jacobian`` cannot be called, or ``start`` has no names.
         ValueError: For arguments that do not fit together, or if every candidate at the start diverged.
         FloatingPointError: If residuals diverge on both sides of a place that was found.
     """
@@ -97,6 +97,8 @@ def fit(
     if not (callable(residuals) or isinstance(residuals, Differentiable)):
         raise TypeError(checks.refusal("fit: residuals", "be a function of values (candidate, parameter)", residuals))
     differentiable = residuals if isinstance(residuals, Differentiable) else None
+    if not (jacobian is None or callable(jacobian)):
+        raise TypeError(checks.refusal("fit: jacobian", "be a function of values (parameter,)", jacobian))
     if method == "gradient" and differentiable is None:
         raise ValueError(checks.refusal("fit: residuals", "be Differentiable for method='gradient'", residuals))
     if differentiable is not None and jacobian is None:
@@ -144,8 +146,8 @@ def leave_out(
     Raises:
         ValueError: For fewer than two groups, or ``held_out``.
     """
-    if len(groups) < 2:
-        raise ValueError(f"leave_out: groups must hold the indices of at least two groups, got {len(groups)}")
+    if not isinstance(groups, (Sequence, np.ndarray)) or isinstance(groups, str) or len(groups) < 2:
+        raise ValueError(checks.refusal("leave_out: groups", "hold the indices of at least two groups", groups))
     if "held_out" in options:
         raise ValueError("leave_out: held_out cannot be given; each group is held out in turn")
     fits = [fit(parameters, residuals, held_out=group, **options) for group in groups]

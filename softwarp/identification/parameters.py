@@ -137,9 +137,12 @@ class Space:
 
         Raises:
             ValueError: For a name that no parameter has, or a value outside its bounds.
+            TypeError: For what has no names.
         """
+        if not (given is None or isinstance(given, Mapping)):
+            raise TypeError(checks.refusal("fit: start", "be values by name, {'modulus': 1e5}", given))
         chosen: dict[str, float | None] = {p.name: p.start for p in self.parameters}
-        for name, told in (given or {}).items():
+        for name, told in ({} if given is None else given).items():
             if name not in chosen:
                 raise ValueError(f"fit: start has {name!r}, which is no parameter; {nearest(name, self.names)}")
             chosen[name] = told

@@ -67,19 +67,28 @@ class Worlds:
 
         Args:
             values: Of exactly ``candidates`` candidates, shape (candidate, parameter).
+
+        Raises:
+            ValueError: For another shape, or values that are not finite; nothing is written then.
         """
+        array = self._values(values, "write")
+        spread = self.spread(array)
         for i, view in self._views:
-            view[...] = view.new_tensor(self.spread(values[:, i]))[:, None]
+            view[...] = view.new_tensor(spread[:, i])[:, None]
 
     def column(self, values: FloatArray, name: str) -> FloatArray:
         """One parameter's value in every world, shape (world,), for what ``write`` does not reach.
 
         Raises:
-            ValueError: If no parameter has the name.
+            ValueError: If no parameter has the name, or values have another shape.
         """
         if name not in self.space.names:
             raise ValueError(f"Worlds.column: {name!r} is no parameter; {nearest(name, self.space.names)}")
-        return self.spread(values[:, self.space.names.index(name)])
+        return self.spread(self._values(values, "column")[:, self.space.names.index(name)])
+
+    def _values(self, values: Any, method: str) -> FloatArray:
+        """Values of candidates, (candidate, parameter); how many there are is for ``spread`` to say."""
+        return checks.array(values, f"Worlds.{method}: values", (None, len(self.space)))
 
     def spread(self, per_candidate: FloatArray) -> FloatArray:
         """An array (candidate, ...) as (world, ...); worlds that are left over repeat the last candidate."""
@@ -108,9 +117,15 @@ class Worlds:
 
         Args:
             per_world: Array or tensor of any device, shape (world, ...).
+
+        Raises:
+            ValueError: If it has no row for every world.
         """
-        on_host = per_world.cpu() if hasattr(per_world, "cpu") else per_world
+        on_host = per_world.detach().cpu() if hasattr(per_world, "cpu") else per_world
         array = np.asarray(on_host).astype(np.float64)
+        if array.ndim == 0 or len(array) != self.sim.num_worlds:
+            need = f"have one row per world ({self.sim.num_worlds})"
+            raise ValueError(checks.refusal("Worlds.gather: per_world", need, per_world))
         array[self.sim.status.cpu().numpy().reshape(-1) > 0] = np.nan
         used = array[: self.candidates * self.experiments]
         return used.reshape(self.candidates, -1)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softwarp import checks
 from softwarp.model.codes import SLOTS, USUAL_SLOTS, CoupleColumn, Target
-from softwarp.model.handles import Handle
+from softwarp.model.handles import Handle, SoftBody
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -239,12 +239,17 @@ class ContactModel:
         """Pairs."""
         return len(self.names)
 
-    def find(self, a: Handle, b: Handle) -> tuple[int, float]:
-        """Pair of two parts, and 1 if they stand in this order, -1 in the other.
+    def find(self, a: Handle | int, b: Handle | int) -> tuple[int, float]:
+        """Pair of two parts, and 1 if they stand in this order, -1 in the other. A plain index means a soft body.
 
         Raises:
-            ValueError: If no such pair was added; the message lists those that were.
+            ValueError: If no such pair was added, or a part is no index; the message lists the pairs that were.
         """
+        for part in (a, b):
+            if not isinstance(part, Handle):
+                advice = f"pairs are {', '.join(self.names)}"
+                checks.count(part, "part of a contact pair, a handle from the builder,", low=0, advice=advice)
+        a, b = (part if isinstance(part, Handle) else SoftBody(part) for part in (a, b))
         for number, (first, second) in enumerate(self.parts):
             for sign, one, two in ((1.0, first, second), (-1.0, second, first)):
                 if (one.kind, int(one)) == (a.kind, int(a)) and (two.kind, int(two)) == (b.kind, int(b)):

@@ -76,3 +76,16 @@ def test_mistakes_are_told_before_work(tmp_path):
         early.reduce(["env=diamond", "modes=-1"], {"out": str(tmp_path / "a.npz")})
     with pytest.raises(ValueError, match="body=leg"):
         reduce.main([*SMALL, "body=leg"], {"out": str(tmp_path / "a.npz")})
+
+
+def test_hexahedra_are_told_before_motion_is_recorded():
+    """Alone, or by their name; beside a body of tetrahedra that one is chosen."""
+    builder = sw.ModelBuilder()
+    material = sw.Corotational(1e5, 0.3)
+    builder.add_hexes(sw.meshing.brick((0.1, 0.1, 0.1), (1, 1, 1)), material=material, density=1e3, name="slab")
+    sim = sw.Simulation(builder.finalize())
+    for name in ("", "slab"):
+        with pytest.raises(ValueError, match=r"slab.* has hexahedra, which cannot be reduced yet"):
+            reduce._body(sim, name)
+    cube = builder.add_tets(sw.meshing.box((0.1, 0.1, 0.1), (1, 1, 1)), material=material, density=1e3)
+    assert reduce._body(sw.Simulation(builder.finalize()), "") == cube

@@ -179,6 +179,11 @@ def test_verbs_refuse_wrong_names(capsys):
     assert "no case 'tentacl'; did you mean 'tentacle'" in capsys.readouterr().err
     assert cli.main(["identify", "segmnt"]) == cli.BAD_INPUT
     assert "no case 'segmnt'; did you mean 'segment'" in capsys.readouterr().err
+    assert cli.main(["identify", "tentacle", "--samples", "-4"]) == cli.BAD_INPUT
+    told = capsys.readouterr()
+    assert "--samples must be an integer of at least 0, got -4" in told.err and "compil" not in told.err + told.out
+    assert cli.main(["identify", "tentacle", "--seed", "-1"]) == cli.BAD_INPUT
+    assert "--seed must be an integer" in capsys.readouterr().err
 
 
 def test_page_and_json(tmp_path, monkeypatch, capsys):

@@ -197,10 +197,12 @@ def test_bad_parameters(arguments, message):
         (LINE, None, {"held_out": np.zeros(3, dtype=bool)}, r"shape \(21,\)"),
         (LINE, None, {"noise": -1.0}, "noise"),
         (LINE, None, {"batch": 0}, "batch"),
+        (LINE, None, {"start": [1.0, 2.0]}, r"start must be values by name, .* got \[1.0, 2.0\]"),
+        (LINE, None, {"jacobian": 3}, "jacobian must be a function of values"),
     ],
 )
 def test_bad_arguments(parameters, residuals, options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         fit(parameters, residuals or line(0.0 * X), **options)
 
 

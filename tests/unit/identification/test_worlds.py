@@ -77,3 +77,19 @@ def test_bad_counts(sim):
         worlds.commands([1.0])
     with pytest.raises(ValueError, match="'modulu' is no parameter; did you mean 'modulus'"):
         worlds.column(np.full((3, 1), 1e5), "modulu")
+
+
+@pytest.mark.parametrize("values", [[[2e4], [np.nan], [2e4]], np.full((3, 2), 2e4), [2e4] * 3, "2e4"])
+def test_bad_values(sim, values):
+    """What is no finite number for every candidate and parameter is written nowhere."""
+    worlds = Worlds(sim, [MODULUS], experiments=2)
+    before = sim.params.rod_youngs.clone()
+    with pytest.raises(ValueError, match=r"Worlds.write: values must be a finite number, in shape \(n, 1\)"):
+        worlds.write(values)
+    assert (sim.params.rod_youngs == before).all()
+
+
+@pytest.mark.parametrize("read", [np.zeros((5, 2)), 1.0])
+def test_readings_of_other_worlds(sim, read):
+    with pytest.raises(ValueError, match=r"Worlds.gather: per_world must have one row per world \(7\)"):
+        Worlds(sim, [MODULUS], experiments=2).gather(read)

@@ -147,6 +147,9 @@ def test_contacts(builder):
     sim = sw.Simulation(builder.finalize())
     with pytest.raises(ValueError, match="are no contact pair; pairs are cube - box"):
         sim.contact_force(SOFT, FLOOR)
+    for part in ("cube", None, 0.5, True, -1):
+        with pytest.raises(ValueError, match=r"part of a contact pair, a handle .*pairs are cube - box"):
+            sim.contact_force(part, BOX)
 
 
 def test_shapeless_body_touches_nothing(builder):
