@@ -29,6 +29,7 @@ from softwarp.envs.scenes.tripod import HEIGHT, SERVOS, build_tripod_scene, trip
 from softwarp.envs.scenes.trunk import build_trunk_scene, trunk_mesh
 from softwarp.meshing.diamond_geometry import coarse_stiffness
 from softwarp.meshing.finger_geometry import FLANGE
+from softwarp.meshing.finger_geometry import TIP as FINGER_TIP
 from softwarp.meshing.tripod_geometry import HELD, HOLE_RADIUS
 from softwarp.meshing.trunk_geometry import LENGTH
 
@@ -44,6 +45,10 @@ DIAMOND_WAYS = 1e-3 * np.array([[0.0, 0.0, -32.51], [0.0, 0.0, 27.70], [32.21, 0
 TRIPOD_LOADS = ((0.0, 0.0, -20.0), (0.0, 0.0, 20.0), (20.0, 0.0, -20.0))  # m/s^2
 # m, of the hole's rim under these: limits that ``fidelity_tripod`` finds
 TRIPOD_WAYS = 1e-3 * np.array([[0.0, -0.13, -4.86], [0.0, 0.25, 4.82], [0.26, -0.13, -4.86]])
+FINGER_END = (FINGER_TIP[0][1], FINGER_TIP[0][0], 0.0)  # m, the middle of the end of its back
+FINGER_LOADS = ((0.0, -0.6, 0.0), (0.0, 0.0, 0.6), (0.6, 0.0, 0.0), (0.3, -0.3, 0.18))  # m/s^2, small ones
+# m, of that point under these: limits that ``assets/gripper/coarsen.py truth`` finds
+FINGER_WAYS = 1e-4 * np.array([[0.160, -2.847, 0.0], [0.0, 0.0, 2.574], [-0.004, 0.3066, 0.0], [0.078, -1.270, 0.772]])
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,8 @@ def weighed(
     point: Sequence[float] | Floats,
     gravity: Sequence[Sequence[float]],
     stiffness: Floats | None = None,
+    *,
+    thin: bool = True,
 ) -> tuple[Floats, Floats]:
     """Where a point of a solid rests under gravity [m/s^2], in float64, (case, 3), and where it is without.
 
@@ -87,12 +94,13 @@ def weighed(
         point: What is looked at [m].
         gravity: One a case.
         stiffness: Factors of the modulus.
+        thin: Whether hexahedra have the modes of walls.
     """
     builder = softwarp.ModelBuilder()
     law = softwarp.Corotational(config.youngs, config.nu, method=config.rotation)
     given: dict[str, Any] = {"material": law, "total_mass": mass, "stiffness": stiffness}
     if isinstance(mesh, meshing.HexMesh):
-        body = builder.add_hexes(mesh, thin=True, **given)
+        body = builder.add_hexes(mesh, thin=thin, **given)
     else:
         lumping = getattr(config, "lumping", "volume") if config.element == "p1" else "volume"
         body = builder.add_tets(mesh, element=config.element, lumping=lumping, **given)
@@ -143,11 +151,14 @@ def _tripod(options: Options) -> tuple[Floats, Floats]:
 
 def _finger(options: Options) -> tuple[Floats, Floats]:
     config = GripperSceneConfig(**options)
-    source = meshing.finger(config.mesh, config.finger)
     held = lambda x: x[:, 0] <= FLANGE[1] + 1.0e-6  # noqa: E731
-    gravity = ((0.0, -60.0, 0.0), (0.0, 60.0, 0.0), (0.0, 0.0, 60.0), (30.0, -30.0, 18.0))
-    point = source.mesh.nodes[source.tip[len(source.tip) // 2]]
-    return weighed(source.mesh, config, config.finger_mass, held, point, gravity)
+    if config.element == "bricks":
+        made = meshing.finger_bricks()
+        return weighed(
+            made.mesh, config, config.finger_mass, held, FINGER_END, FINGER_LOADS, made.stiffness, thin=False
+        )
+    mesh = meshing.finger(config.mesh, config.finger).mesh
+    return weighed(mesh, config, config.finger_mass, held, FINGER_END, FINGER_LOADS)
 
 
 def _pad(options: Options) -> tuple[Floats, Floats]:
@@ -203,8 +214,8 @@ ROBOTS = {
     "Gripper": Robot(
         lambda options, builder: build_gripper_scene(GripperSceneConfig(**options), builder),
         _finger,
-        SOLID,  # of the medium mesh it would have 22 000 nodes a finger
-        {"default": {}, "medium": {"mesh": "medium"}, "p2": SOLID},
+        FINGER_WAYS,
+        {"default": {}, "medium": {"mesh": "medium"}, "p2": SOLID, "accurate": {"fidelity": "accurate"}},
         drive=_pull,
     ),
     "Tripod": Robot(

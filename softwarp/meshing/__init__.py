@@ -8,6 +8,7 @@ from softwarp.meshing.diamond_geometry import diamond
 from softwarp.meshing.embedding import embed
 from softwarp.meshing.figurine_geometry import figurine
 from softwarp.meshing.filling import tetrahedralize
+from softwarp.meshing.finger_bricks import FingerBricks, finger_bricks
 from softwarp.meshing.finger_geometry import FingerMesh, finger
 from softwarp.meshing.hexes import HexMesh, brick, check_hexes, quad_shares
 from softwarp.meshing.lumen import Lumen
@@ -56,6 +57,7 @@ __all__ = [
     "EDGES",
     "CavityWall",
     "CupMesh",
+    "FingerBricks",
     "FingerMesh",
     "HexMesh",
     "Lumen",
@@ -90,6 +92,7 @@ __all__ = [
     "face_shares",
     "figurine",
     "finger",
+    "finger_bricks",
     "helix",
     "intersection",
     "mean_edge",

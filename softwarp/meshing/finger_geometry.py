@@ -81,22 +81,31 @@ def finger(resolution: str = "coarse", kind: str = "cavities") -> FingerMesh:
     for what, name, known in (("resolution", resolution, DETAILS), ("kind", kind, KINDS)):
         check_name(name, known, "finger", what)
     parts = DETAILS[resolution]
-    sections, hollow = _bellows_finger() if kind == "cavities" else _plain_finger()
-    grid = _refined(sections, parts)
+    sections, hollow = bellows_finger() if kind == "cavities" else _plain_finger()
+    grid = refined(sections, parts)
     cells = np.repeat(np.repeat(np.repeat(hollow, parts, axis=0), parts, axis=1), parts, axis=2)
     tets = _cut(grid.shape[:3], cells == 0)
     used, corners = np.unique(tets, return_inverse=True)
     nodes = grid.reshape(-1, 3)[used]
     mesh = TetMesh(nodes, orient(nodes, corners.reshape(-1, 4).astype(np.int32)), f"{kind} finger {resolution}")
     cavities = tuple(_wall(grid, cells, number) for number in range(1, int(hollow.max()) + 1))
+    return FingerMesh(mesh, cavities, *cable_path(), *tip_and_base(nodes))
+
+
+def cable_path() -> tuple[FloatArray, FloatArray]:
+    """Points of the cable [m], shape (6, 3), from the base to the tip, and where it leaves the base, (3,)."""
     cable = np.stack([np.array(CABLE_X), np.full(len(CABLE_X), CABLE_Y), np.zeros(len(CABLE_X))], axis=1)
+    return cable, np.array([PULL_X, CABLE_Y, 0.0])
+
+
+def tip_and_base(nodes: FloatArray) -> tuple[IntArray, IntArray]:
+    """Nodes at the end of the back, from negative to positive z, and those of the flange."""
     tip = np.flatnonzero((nodes[:, 0] > TIP[0][1] - 1e-9) & (nodes[:, 1] > BACK - 1e-9))
     base = np.flatnonzero(nodes[:, 0] < FLANGE[1] + 1e-9)
-    order = tip[np.argsort(nodes[tip, 2])].astype(np.int32)
-    return FingerMesh(mesh, cavities, cable, np.array([PULL_X, CABLE_Y, 0.0]), order, base.astype(np.int32))
+    return tip[np.argsort(nodes[tip, 2])].astype(np.int32), base.astype(np.int32)
 
 
-def _bellows_finger() -> tuple[FloatArray, IntArray]:
+def bellows_finger() -> tuple[FloatArray, IntArray]:
     """Nodes of the sections, shape (station, column, row, 3), and cells: 0 solid, else the number of a cavity."""
     sections, joint_of = [_block(x, FLANGE[2]) for x in FLANGE[:2]], [0, 0]
     profile = [(-x, inner, outer) for x, inner, outer in reversed(BELLOWS[1:])] + list(BELLOWS)
@@ -172,7 +181,7 @@ def _arc(radius: float, parts: tuple[float, ...]) -> FloatArray:
     return radius * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
 
 
-def _refined(sections: FloatArray, parts: int) -> FloatArray:
+def refined(sections: FloatArray, parts: int) -> FloatArray:
     """The grid of nodes with each cell cut into equal parts along its three axes, trilinearly."""
     for axis in range(3):
         count = sections.shape[axis]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from softwarp.envs.options import (
     AngleRange,
@@ -28,10 +29,13 @@ from softwarp.envs.options import (
     check_options,
 )
 from softwarp.envs.options.base import EnvConfig
+from softwarp.envs.options.fidelity import FidelityConfig
 from softwarp.ranges import Range
 
 FINGERS = ("cavities", "plain")
 RESOLUTIONS = ("coarse", "medium", "fine")
+ELEMENTS = ("p1", "p2", "bricks")
+BRICK_NU = 0.48  # that factors of the moduli of bricks are fitted for
 OBJECTS = ("soft_cube", "cube", "sphere", "capsule", "figurine")
 ACTION_KINDS = ("continuous", "discrete")
 CABLE_KINDS = ("both", "each")
@@ -53,7 +57,7 @@ BORNE = {
     "plain": 5.0e-6,
 }  # m^2, tension over youngs that empty fingers bear: 200 N
 SQUEEZE = 4.0e-6  # m^2, normal force of a finger over its youngs, at most: 78 N on an object 70 mm wide
-SUPPLE = 0.25  # times that for quadratic elements, which bend more easily
+SUPPLE = 0.25  # times that for quadratic elements and bricks, which bend more easily
 CLEARANCE = 0.004  # m, between what must not touch at the start
 
 Growth = Annotated[tuple[float, float], Range(low=0.0, high=0.02, rising=True)]  # m
@@ -62,14 +66,14 @@ Cells = Annotated[int, Range(low=1, high=20)]
 
 
 @dataclass(kw_only=True)
-class GripperSceneConfig:
+class GripperSceneConfig(FidelityConfig):
     """Options of the scene; the fingers are SofaGym's, gravity is real."""
 
     finger: str = "cavities"  # "cavities" (SofaGym's shape) or "plain" (a simpler one with a third of the nodes)
     mesh: str = "coarse"  # "coarse", "medium" or "fine"
     youngs: Modulus = 20.0e6  # Pa, of the fingers
     nu: PoissonRatio = 0.48
-    element: str = "p1"  # "p1" (linear tetrahedra, too stiff) or "p2" (quadratic ones between the same nodes)
+    element: str = "p1"  # "p1" (linear tetrahedra, too stiff), "p2" (quadratic ones) or "bricks" (fitted hexahedra)
     rotation: str = "warped"  # "warped", "polar", or "large" (SOFA's, which pushes symmetric fingers sideways)
     finger_mass: Mass = 0.1  # kg, of one
     rayleigh: Rayleigh = (0.0, 0.0)  # 1/s on mass, s on stiffness, of the fingers
@@ -94,14 +98,23 @@ class GripperSceneConfig:
     max_speed: Speed = 0.25  # m/s, of the hand
     max_spin: Speed = 4.0  # rad/s
 
+    ACCURATE: ClassVar[Mapping[str, Any]] = {"finger": "cavities", "mesh": "coarse", "element": "bricks"}
+
     def __post_init__(self) -> None:
         """Refuse what cannot be built or held."""
         check_options(self)
+        self.take_fidelity()
         for name, choices in (("finger", FINGERS), ("mesh", RESOLUTIONS), ("object", OBJECTS)):
             check_choice(self, name, choices)
-        check_choice(self, "element", ("p1", "p2"))
+        check_choice(self, "element", ELEMENTS)
         check_choice(self, "rotation", ("large", "polar", "warped"))
         label = type(self).__name__
+        asked = (self.finger, self.mesh, self.rotation, self.nu)
+        if self.element == "bricks" and asked != ("cavities", "coarse", "warped", BRICK_NU):
+            raise ValueError(
+                f"{label}: element='bricks' has a mesh of its own with fitted moduli and needs finger='cavities', "
+                f"mesh='coarse', rotation='warped' and nu={BRICK_NU:g}, got {asked}; leave element and fidelity out"
+            )
         if self.touch and self.finger != "cavities":
             raise ValueError(
                 f"{label}: touch=True needs fingers with cavities, the finger {self.finger!r} has none; take "
@@ -121,7 +134,7 @@ class GripperSceneConfig:
                 f"{label}: hand_z must begin at {CLOSED_DEPTH:g} m or higher, so that closing fingers pass "
                 f"above the floor, got {self.hand_z}"
             )
-        check_borne(self, BORNE[self.finger] * (SUPPLE if self.element == "p2" else 1.0))
+        check_borne(self, BORNE[self.finger] * (1.0 if self.element == "p1" else SUPPLE))
         self._check_grasp(label)
 
     def _check_grasp(self, label: str) -> None:

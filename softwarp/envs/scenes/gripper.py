@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,7 +67,8 @@ def build_gripper_scene(config: GripperSceneConfig, builder: ModelBuilder) -> Gr
     floor = builder.add_rigid(shapes.Plane(), kinematic=True, name="floor")
     fingers, cables, tips, cavities = [], [], [], []
     for side, name in zip(SIDES, ("right", "left"), strict=True):
-        source = meshing.finger(config.mesh, config.finger)
+        is_brick = config.element == "bricks"
+        source = meshing.finger_bricks() if is_brick else meshing.finger(config.mesh, config.finger)
         finger, cable, tip = _add_finger(config, builder, source, hand, side, name)
         fingers.append(finger)
         cables.append(cable)
@@ -109,22 +110,24 @@ def placed(points: ArrayLike, side: float, height: float) -> NDArray[np.float64]
 def _add_finger(
     config: GripperSceneConfig,
     builder: ModelBuilder,
-    source: meshing.FingerMesh,
+    source: meshing.FingerMesh | meshing.FingerBricks,
     hand: RigidBody,
     side: float,
     name: str,
 ) -> tuple[SoftBody, int, int]:
     """One finger, its base held by the hand, its cable and the marker at its end."""
     nodes = placed(source.mesh.nodes, side, config.hand_start)
-    finger = builder.add_tets(
-        nodes,
-        source.mesh.tets,
-        material=Corotational(config.youngs, config.nu, method=config.rotation),
-        element=cast('Literal["p1", "p2"]', config.element),
-        total_mass=config.finger_mass,
-        rayleigh=config.rayleigh,
-        name=f"{name}_finger",
-    )
+    given: dict[str, Any] = {
+        "material": Corotational(config.youngs, config.nu, method=config.rotation),
+        "total_mass": config.finger_mass,
+        "rayleigh": config.rayleigh,
+        "name": f"{name}_finger",
+    }
+    if isinstance(source, meshing.FingerBricks):
+        finger = builder.add_hexes(nodes, source.mesh.hexes, stiffness=source.stiffness, **given)
+    else:
+        element = cast('Literal["p1", "p2"]', config.element)
+        finger = builder.add_tets(nodes, source.mesh.tets, element=element, **given)
     held = source.base
     if config.element == "p2":  # the middles of edges between held nodes as well
         where = builder.bodies[finger].mesh.nodes
@@ -143,14 +146,16 @@ def _add_finger(
         tolerance=OUTSIDE,
         name=f"{name}_cable",
     )
-    tip = builder.add_marker(finger, nodes[source.tip[len(source.tip) // 2]], tolerance=OUTSIDE, name=f"{name}_tip")
+    ends, half = source.tip, len(source.tip) // 2
+    middle = 0.5 * (nodes[ends[half]] + nodes[ends[-1 - half]])
+    tip = builder.add_marker(finger, middle, tolerance=OUTSIDE, name=f"{name}_tip")
     return finger, cable, tip
 
 
 def _close_cavities(
     config: GripperSceneConfig,
     builder: ModelBuilder,
-    source: meshing.FingerMesh,
+    source: meshing.FingerMesh | meshing.FingerBricks,
     finger: SoftBody,
     side: float,
     name: str,

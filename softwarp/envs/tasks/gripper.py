@@ -27,6 +27,10 @@ SofaGym's hand does not travel: springs at its base pull it back to the start. O
 speed allows. Its gravity is a thousandth of ours, its cube an empty shell, its fingertip a node of the base.
 ``GripperConfig.paper`` has its actions, its cube's mass, its observation and its reward.
 
+The fingers' linear tetrahedra are too stiff: under small forces their tips go a fifth of the way of converged ones.
+With ``fidelity="accurate"``, bricks with fitted moduli, they are within 1.4 % of it, and under commanded cables within
+1.9 % (by default 17 to 22 %), in the same time; tensions of a closed hand are then up to 24 % too large.
+
 The size of an object is that of its surface plus ``object_growth``, by which it reaches farther on all sides, edges
 rounded: worlds share the geometry and differ in that distance. Masses, moduli and friction differ at will.
 """

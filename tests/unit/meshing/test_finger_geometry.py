@@ -114,3 +114,23 @@ def test_figurine_is_a_solid_that_stands(width):
 def test_figurine_without_width():
     with pytest.raises(meshing.MeshError, match=r"width \[m\] must be"):
         meshing.figurine(0.0)
+
+
+def test_bricks_are_the_finger_in_hexahedra():
+    """Box, volume and cavities of the tetrahedra, its own mirror image, moduli too; its flange and cable."""
+    made, tets = meshing.finger_bricks(), meshing.finger()
+    mesh = made.mesh
+    assert (len(mesh.nodes), len(mesh.hexes)) == (432, 231)
+    np.testing.assert_allclose(mesh.nodes.min(axis=0), LOW, atol=1e-15)
+    np.testing.assert_allclose(mesh.nodes.max(axis=0), HIGH, atol=1e-15)
+    np.testing.assert_allclose(mesh.volume, tets.mesh.volume, rtol=1e-4)
+    for mine, theirs in zip(made.cavities, tets.cavities, strict=True):
+        np.testing.assert_allclose(mine[0].mean(axis=0), theirs[0].mean(axis=0), atol=5e-4)
+        np.testing.assert_allclose(meshing.surface_volume(*mine), AIR, rtol=5e-3)
+    middles = mesh.nodes[mesh.hexes].mean(axis=1)
+    image = [np.argmin(np.linalg.norm(middles - m, axis=1)) for m in middles * [1.0, 1.0, -1.0]]
+    np.testing.assert_allclose(middles[image] * [1.0, 1.0, -1.0], middles, atol=1e-12)
+    np.testing.assert_array_equal(made.stiffness[image], made.stiffness)
+    assert made.stiffness.min() > 0.1 and len(np.unique(made.regions)) == 25
+    assert len(made.base) == 48 and len(made.tip) == 6
+    np.testing.assert_array_equal(made.cable, tets.cable)
