@@ -22,7 +22,7 @@ from typing import Any
 import warp as wp
 from warp._src import context
 
-from softwarp import kernel_cache, notices
+from softwarp import kernel_cache, notices, recording
 
 QUIET_SECONDS = 1.5  # of compiling before it is told
 PAUSE = 0.4  # s without compiling after which what comes next is told anew
@@ -234,6 +234,7 @@ def _listen() -> None:
 
     context.Module._compile = told
     kernel_cache.share()
+    recording.quicken()
     own = wp.get_logger()
     if wp.config.log_level == wp.LOG_INFO and type(own).__module__.startswith("warp."):  # nobody has chosen otherwise
         wp.set_logger(_Logger(own))

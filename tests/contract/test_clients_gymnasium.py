@@ -189,7 +189,13 @@ def test_record_video(tmp_path, vector_of):
     assert {path.suffix for path in tmp_path.iterdir()} == {".mp4"}
 
 
-LARGE = ("CatheterBeam", "SimpleMaze", "TrunkCup", "MultiGaitFull")  # made elsewhere in CI, and slow to make
+LARGE = (
+    "CatheterBeam",
+    "SimpleMaze",
+    "TrunkCup",
+    "MultiGaitFull",
+    "ConcentricTubeRobot",
+)  # made elsewhere in CI, and slow to make
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in NAMES])

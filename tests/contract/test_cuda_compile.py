@@ -42,9 +42,17 @@ COMPILED: set[wp.Kernel] = set()  # found in PTX; a later factory may bring some
 
 
 LONG = {
-    *("collision.keeping", "collision.surface_phase", "elements.quadratic", "elements.turning"),
+    *(
+        "collision.keeping",
+        "collision.surface_phase",
+        "collision.shapes_phase",
+        "elements.quadratic",
+        "elements.turning",
+    ),
+    *("elements.floating_adjoint", "elements.directional", "elements.hex_adjoint", "elements.floating_inertia"),
     *("frames.gyration", "frames.gyration_adjoint", "frames.inertia", "frames.momentum", "frames.windup"),
-    *("rows.touch_adjoint", "rows.touch_directional", "rows.touch_gather"),
+    *("frames.adjoint", "frames.extrapolated_adjoint", "frames.leaning_adjoint", "linear.cholesky_panels"),
+    *("rows.touch_adjoint", "rows.touch_directional", "rows.touch_gather", "rows.joint_adjoint", "rows.contact_panel"),
     *("inverse.laws", "inverse.program", "inverse.settling"),
 }
 
@@ -73,7 +81,14 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
 def is_slow(module: str, choice: dict[str, Any]) -> bool:
     """Whether others that compile in less time show as much, as they are written in the same way."""
     usual = {"law": "neo_hookean", "own_contacts": 1, "near_rows": 104, "project": True}
-    usual |= {"by_parameters": True, "is_large": False, "together": True, "varying": False, "near_unknowns": 0}
+    usual |= {
+        "modes": 48,
+        "by_parameters": True,
+        "is_large": False,
+        "together": True,
+        "varying": False,
+        "near_unknowns": 0,
+    }
     return module.removeprefix("kernels.") in LONG or any(
         choice.get(key, value) != value for key, value in usual.items()
     )

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 # Lowest first. Names on one line may not import each other; what is listed is a file or a folder below softwarp.
 LAYERS = (
     ("host", "notices", "remembered", "unpicklable"),
-    ("kernel_cache",),
+    ("kernel_cache", "recording"),
     ("compiling",),
     ("advice", "checks", "io.atomic", "io.bounded", "threads"),
     ("ranges",),

@@ -106,7 +106,7 @@ def test_pressure_limits_are_relief_valves(control):
 # Laws
 
 
-@pytest.mark.parametrize("exponent", [1.0, 1.4])
+@pytest.mark.parametrize("exponent", [pytest.param(1.0, marks=pytest.mark.slow), 1.4])
 def test_sealed_gas_answers_a_load(exponent):
     """A force squeezes a sealed chamber: p = p_a (G / V)^kappa - p_a to 1e-9, and the gas stiffens the body."""
     case = cases.bender()

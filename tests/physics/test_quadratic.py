@@ -357,7 +357,7 @@ def test_workspace_carries_nothing_over(law: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "law", ["large", "stvk", *(pytest.param(law, marks=pytest.mark.slow) for law in ("warped", "corot"))]
+    "law", ["large", *(pytest.param(law, marks=pytest.mark.slow) for law in ("stvk", "warped", "corot"))]
 )
 def test_paths_and_precisions_agree(law: str) -> None:
     """Lanes and scalars differ by rounding of float32, which differs from float64 as far as it may."""

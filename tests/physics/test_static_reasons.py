@@ -59,7 +59,9 @@ def rollers(part: str, element: str = "p1", precision: str = "float64", worlds: 
 
 
 @pytest.mark.parametrize("element", [pytest.param("p1", marks=pytest.mark.slow), "p2"])
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize(
+    "part", [pytest.param(part, marks=pytest.mark.slow) if part == "plain" else part for part in PARTS]
+)
 def test_single_axes_stay_held(part: str, element: str) -> None:
     """Held coordinates do not move at all, others do, on every path; and all paths find one shape, within 2e-4."""
     reference = None

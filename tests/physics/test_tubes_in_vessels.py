@@ -84,6 +84,7 @@ def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.asarray(v + q[3] * t + np.cross(q[:3], t))
 
 
+@pytest.mark.slow  # 20 s; test_forces_of_the_wall_balance_the_base and test_wire_in_bend press on such walls, too
 def test_nothing_leaves_the_nasal_passage() -> None:
     """Random insertion and turns of ConcentricTubeRobot, 6400 steps: no node is nearer to the wall than its radius.
 

@@ -29,7 +29,9 @@ def block(element: str, law: str, rng: np.random.Generator, strain: float, **opt
 
 @each_element
 @pytest.mark.parametrize("strain", [0.02, 0.2])
-@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-12), ("float32", 1e-4)])
+@pytest.mark.parametrize(
+    ("precision", "tolerance"), [("float64", 1e-12), pytest.param("float32", 1e-4, marks=pytest.mark.slow)]
+)
 def test_forces_are_those_of_polar(element: str, strain: float, precision: str, tolerance: float) -> None:
     """The same rotation as the singular value decomposition gives, to rounding."""
     force = [
@@ -76,7 +78,7 @@ def test_an_inverted_element_comes_back() -> None:
     np.testing.assert_allclose(sim.node_x[0, 3], nodes[3], atol=1e-4)
 
 
-@each_element
+@pytest.mark.parametrize("element", ["p1", pytest.param("p2", marks=pytest.mark.slow)])
 def test_statics_are_those_of_polar(element: str) -> None:
     """The exact tangent of the static solve: the same equilibrium as polar in as many iterations, large bending."""
     mesh: Any = meshing.box((1.0, 0.1, 0.1), (10, 1, 1))

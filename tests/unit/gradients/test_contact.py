@@ -152,7 +152,7 @@ def test_bodies_that_carry_what_touches(base: str, passes: int) -> None:
     check(Rollout(sim), given, lambda states: loss(states) + (states.marker_x * weight).sum(dim=(0, 2, 3)), own=1e-6)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 def test_kept_states_factors_and_worlds_beside_change_no_bit(precision: str) -> None:
     """Steps taken again, factors kept, and a world alone have the bits of a batch that keeps every state."""
     seeds = (1, 2, 3)

@@ -170,6 +170,7 @@ def bent(num_worlds: int) -> sw.Simulation:
     return sw.Simulation(builder.finalize(num_worlds, precision="float64"))
 
 
+@pytest.mark.slow  # 45 s; the other tests here and the carried beams of test_relaxation prove such gradients
 def test_far_from_the_tangent_of_a_step() -> None:
     """Steps without momentum, and corrections of the adjoint, would go away in a few directions; worlds change no bit.
 

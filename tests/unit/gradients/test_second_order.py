@@ -104,7 +104,7 @@ def test_a_blow(thirds: list[bool]) -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"law": "nh_log", "pressure_tangent": True}], ids=["plain", "tangent"])
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_smooth_and_rough_worlds_change_no_bit_of_each_other(precision: str, options: dict[str, Any]) -> None:
     """Worlds of a batch have the gradients of each alone; float32 has other paths for one world and for many."""
 
@@ -122,7 +122,7 @@ def test_smooth_and_rough_worlds_change_no_bit_of_each_other(precision: str, opt
                 assert torch.equal(batch[group][name].select(axis, world), wanted), (seeds, group, name)
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_worlds_beside_change_no_bit_of_contact(precision: str) -> None:
     """The same of what touches, beside a world that flies."""
 

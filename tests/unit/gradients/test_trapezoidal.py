@@ -126,7 +126,7 @@ def test_the_trapezoidal_rule(options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("scene", [swinging, carrying])
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_worlds_beside_change_no_bit_of_the_trapezoidal_rule(
     precision: str, scene: Callable[..., sw.Simulation]
 ) -> None:

@@ -361,7 +361,7 @@ def test_sealed_gas_balances_a_piston():
     np.testing.assert_allclose(p, ambient * (G / V) ** kappa - ambient, rtol=1e-12)
 
 
-@pytest.mark.parametrize("parts", [1, team.PARTS])
+@pytest.mark.parametrize("parts", [pytest.param(1, marks=pytest.mark.slow), team.PARTS])
 def test_threads_of_a_gpu_share_a_volume(parts, monkeypatch):
     """Two chambers of eleven worlds, to rounding as a sum over all points; on a CPU threads of a block are fibers."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", parts > 1)

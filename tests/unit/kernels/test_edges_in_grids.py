@@ -18,7 +18,7 @@ def samples():
     return np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), axis=1) - RADIUS
 
 
-@pytest.mark.parametrize("real", [wp.float64, wp.float32])
+@pytest.mark.parametrize("real", [wp.float64, pytest.param(wp.float32, marks=pytest.mark.slow)])
 def test_only_what_is_far_is_left_out(real, rng):
     """By 257 places of each of 2 000 edges; with care for all, the part is that around the lowest of nine samples."""
     f, vec3 = edges_in_grids.functions(real), shapes.functions(real).vec3

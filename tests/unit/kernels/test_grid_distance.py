@@ -49,7 +49,7 @@ def axes():
     return [ORIGIN[c] + SPACING * np.arange(NODES[c]) for c in range(3)]
 
 
-@pytest.mark.parametrize("real", [wp.float64, wp.float32])
+@pytest.mark.parametrize("real", [wp.float64, pytest.param(wp.float32, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("distance", [ball, box])
 def test_grid_distance(distance, real, rng):
     """Bit for bit ``grid``'s, inside, on the border and beside; inside it errs as a trilinear interpolant does.

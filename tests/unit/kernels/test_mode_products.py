@@ -51,7 +51,7 @@ def test_stiffness_in_modes(size, worlds):
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
-@pytest.mark.parametrize("modes", [16, 48, 80, 96])
+@pytest.mark.parametrize("modes", [16, *(pytest.param(count, marks=pytest.mark.slow) for count in (48, 80, 96))])
 def test_stiffness_on_tensor_cores(modes, device):
     """E' K E of the second of two bodies with its tets and triangles, as exact as sums of float32; an odd world too."""
     draws, first, count = np.random.default_rng(modes), 5, {samples.TET: 21, samples.TRI: 10}
@@ -184,7 +184,7 @@ def test_rows_on_modes(team):
         np.testing.assert_allclose(found[:, wide[row] : wide[row] + stride[row]], own @ b, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_places_of_nodes_of_two_bodies(precision):
     """X + Phi q and Phi v of nodes that threads take four at a time, some of both bodies; the rest is left alone."""
     draws, real = np.random.default_rng(2), wp.float64 if precision == "float64" else wp.float32
@@ -212,7 +212,7 @@ def test_places_of_nodes_of_two_bodies(precision):
             np.testing.assert_allclose(values.numpy(), wanted.reshape(WORLDS, 30), rtol=fine, atol=fine)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_velocities_of_touching_nodes(precision):
     """Phi v of nodes of two bodies, behind the dofs, as a thread for each node finds it."""
     draws, real = np.random.default_rng(6), wp.float64 if precision == "float64" else wp.float32

@@ -11,7 +11,7 @@ SIZE, CONTACTS, ROWS, WORLDS = 11, 37, 2, 2
 ORDER = ROWS + 3 * CONTACTS
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def test_products_near_and_far(monkeypatch: pytest.MonkeyPatch, precision: str, device: str) -> None:
     """The same entries as threads without shared memory find, of late contacts too; others keep theirs."""

@@ -9,7 +9,13 @@ from softwarp.kernels.algebra.vectors import algebra
 from softwarp.solvers.workspace.rows import allocate
 
 VARIANTS = [lanes.variant("scalar", "float64"), lanes.variant("scalar"), lanes.variant("lanes")]
-every_variant = pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.key)
+every_variant = pytest.mark.parametrize(
+    "variant",
+    [
+        pytest.param(variant, id=variant.key, marks=pytest.mark.slow if variant.key == "scalar_f32" else ())
+        for variant in VARIANTS  # float64 proves the source, lanes what float32 leaves of it
+    ],
+)
 WORLDS = 8
 
 

@@ -361,8 +361,14 @@ def many(rng: np.random.Generator, worlds: int) -> tuple[RodGeometry, np.ndarray
     return geometry, np.stack([moved(pose, size * rng.standard_normal((7, 6))) for _ in range(worlds)])
 
 
-@pytest.mark.parametrize("project", [True, False])
-@pytest.mark.parametrize("name", ["scalar", "lanes"])
+@pytest.mark.parametrize(
+    ("name", "project"),
+    [
+        ("scalar", False),
+        ("lanes", True),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("scalar", True), ("lanes", False))),
+    ],
+)
 def test_float32_and_lanes_agree_with_float64(name: str, project: bool, rng: np.random.Generator) -> None:
     """Differences are those of rounding poses and arithmetic to float32: 1e-7, times a few."""
     geometry, pose = many(rng, 11)

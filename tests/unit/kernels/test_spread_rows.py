@@ -12,7 +12,7 @@ WORLDS, SIZE, CONTACTS, NODES = 2, 40, 3, 5
 BODY_BLOCKS = (range(1, 35), range(35, 40))  # dofs of two bodies' modes; dof 0 is none
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_threads_share_the_modes_of_a_contact(precision: str) -> None:
     """Two nodes of one body, one of another and a dof that is no mode, to the bit as a thread alone adds them."""
     variant = lanes.variant("cuda", precision)

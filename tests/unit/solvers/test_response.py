@@ -421,7 +421,7 @@ def test_unknown_unbounded_row_is_named() -> None:
         )
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 def test_kernels_for_contacts_on_many_modes(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, precision: str
 ) -> None:
