@@ -266,6 +266,8 @@ def held_out_env(config: TrainConfig, *, num_worlds: int) -> Any:
     options = dict(config.env)
     if "goal_split" in options:
         options["goal_split"] = "eval"
+    if "goal_repeat" in options:
+        options["goal_repeat"] = 0.0
     name, env_config = make_env_config(options)
     return registry.make(
         name, num_worlds=num_worlds, device=config.device, seed=config.evaluation_seed, config=env_config

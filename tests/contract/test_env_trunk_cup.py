@@ -121,6 +121,29 @@ def test_a_loose_grip_is_told():
     assert TrunkCupConfig().firm_grip == 0.5
 
 
+def test_goals_that_were_missed_come_again():
+    """As often as ``goal_repeat`` says, by the world's own draws; those that were met do not, nor across seeds."""
+    env = make(num_worlds=64, goal_repeat=0.75, settle=False)
+    env.reset()
+    first = env.goal.clone()
+    env.goal[:32].copy_(env.tip()[:32])
+    env.goal_axis[:32].copy_(env.axis()[:32])
+    meant, axes = env.goal.clone(), env.goal_axis.clone()
+    env.apply_action(torch.zeros(64, CABLES), 0)
+    saved = env.snapshot()
+    env.reset()
+    again = (env.goal == meant).all(dim=1)
+    assert torch.equal(again, (env.goal_axis == axes).all(dim=1))
+    assert not again[:32].any() and 17 <= int(again[32:].sum()) <= 30
+    other = make(num_worlds=64, seed=2, goal_repeat=0.75, settle=False)
+    other.restore(saved)
+    other.reset()
+    assert torch.equal((other.goal == meant).all(dim=1), again)
+    env.set_seed(1)
+    env.reset()
+    assert torch.equal(env.goal, first)
+
+
 @pytest.mark.slow
 def test_dropping_ends_the_episode():
     """Cables let go: the cup falls, the episode terminates with the penalty, and a new one starts in the grasp."""

@@ -21,7 +21,10 @@ def normal_forces(sim):
 
 @pytest.mark.slow
 def test_grip_does_not_fade():
-    """Effort is saved where it may be: on the grasp, of 4.8 N. After a second it is 1.5 N and falls; a grip keeps 2."""
+    """Effort is saved where it may be: on the grasp, of 5.1 N. After 2.4 s it is below 0.9 N; a grip keeps 2.
+
+    On the way there roundings decide: targets a micrometre apart leave 0.7 to 1.8 N after half of that time.
+    """
     env = registry.make("TrunkCup", num_worlds=len(ROWS), seed=0)
     pose = torch.from_numpy(reachable_poses()[0][ROWS])
     shift = 0.5 * HEIGHT * pose[:, 3:]
@@ -33,12 +36,12 @@ def test_grip_does_not_fade():
         start = normal_forces(env.sim).clone()
         options = env.steering | {"grip": grip}
         controller = InverseController(env.sim, points, period=env.control_dt, **options)
-        for _ in range(24):
+        for _ in range(48):
             controller.solve(targets)
             env.sim.step(env.action_repeat)
         left.append(normal_forces(env.sim).clone())
     assert (start > 4.0).all()
-    assert (left[0] < 1.7).all()
+    assert (left[0] < 1.2).all()
     assert (left[1] > 1.6).all()
 
 

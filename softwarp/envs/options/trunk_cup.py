@@ -19,6 +19,7 @@ from softwarp.envs.options import (
     Positive,
     PositiveRange,
     Rayleigh,
+    Share,
     check_choice,
     check_options,
 )
@@ -84,6 +85,7 @@ class TrunkCupConfig(TrunkCupSceneConfig, CableReachConfig):
     goal_jitter: Distance = 0.001  # m, uniform on each axis
     axis_tolerance: HalfAngle = 0.17453292519943295  # rad, 10 degrees; pi asks for the position alone
     axis_lever: Length = 0.0286  # m that a radian is worth: 10 degrees are 5 mm
+    goal_repeat: Share = 0.0  # probability of the same goal anew after an episode whose last action began off it
     drop_distance: Length = 0.080  # m between cup and trunk from which the cup counts as dropped
     drop_penalty: NotNegative = 5.0  # taken from the reward of the action in which the cup is dropped
     grip_weight: NotNegative = 0.0  # taken where the contacts' loads add up to nothing, less up to ``firm_grip``

@@ -9,7 +9,8 @@ Observation  compact: 64 numbers of order 1, see ``COMPACT``
              paper:   66 raw metres: 21 stations (mean of the long cables' points), then the goal
 Start        wrapped: the trunk holds the cup, at rest
              open: the cup stands on a table, at a place drawn within 3 mm, the trunk lies straight beside it
-Goal         workspace: a pose in which the grasp was seen to hold the cup, its place jittered by 1 mm
+Goal         workspace: a pose in which the grasp was seen to hold the cup, its place jittered by 1 mm; with
+             ``goal_repeat`` the one before anew, where it was not met
              list: one of ``goal_list``, with the axis of the start
 Reward       shaped: progress (e_prev - e) / 10 mm, e = sqrt(d^2 + (28.6 mm * angle)^2);
              precision 1 / (1 + (e / 10 mm)^2);  effort -0.01 mean(a^2);  drop -5;  start="open": carry +0.1 of the
@@ -106,7 +107,7 @@ MILLIMETRE = 0.001
 CLEARANCE = 0.002  # m, of the cup's bottom above the table in goals of start="open"
 LYING = 0.4  # heights of the cup above the table below which its middle is when it was knocked over; standing: 0.5
 
-_STREAM_YOUNGS, _STREAM_MASS, _STREAM_FRICTION, _STREAM_PLACE = range(1, 5)
+_STREAM_YOUNGS, _STREAM_MASS, _STREAM_FRICTION, _STREAM_PLACE, _STREAM_REPEAT = range(1, 6)
 
 
 class TrunkCup(CableReach):
@@ -226,7 +227,10 @@ class TrunkCup(CableReach):
         g = float(torch.tensor(config.gravity).norm())
         self._weight = max(config.cup_mass * g, 1.0e-6)  # N, by which carrying is measured
         self.goal_axis = self.add_world_state("goal_axis", 3)
-        self._error_before = torch.zeros(self.num_worlds, device=device)  # m, at the start of an action
+        # m, at the start of an action; of a past episode it is state where goals are repeated
+        self._error_before = torch.zeros(self.num_worlds, device=device)
+        if config.goal_repeat:
+            self._error_before = self.add_world_state("error_before")
         self._cup_density = self.sim.params.density[:1, self.scene.cup].clone()
         self._scale = compact_scale(COMPACT).to(device)
         self.observation_layout, self.length_scale = observation_layout(config.observation)
@@ -241,11 +245,17 @@ class TrunkCup(CableReach):
         place = pose[:, :3]
         if self.config.goals == "workspace":
             place = place + self.config.goal_jitter * (2.0 * u[:, 1:] - 1.0)
-        torch.where(chosen, place, self.goal, out=self.goal)
-        torch.where(chosen, pose[:, 3:], self.goal_axis, out=self.goal_axis)
+        fresh = chosen & ~self._again()[:, None] if self.config.goal_repeat else chosen
+        torch.where(fresh, place, self.goal, out=self.goal)
+        torch.where(fresh, pose[:, 3:], self.goal_axis, out=self.goal_axis)
         if self.is_open:
             self._place_cup(mask)
         self._randomize(mask)
+
+    def _again(self) -> Tensor:
+        """Worlds that keep the goal of the episode before, which it was away from: bool (world,)."""
+        missed = (self._episode > 0) & (self._error_before > self.config.success_tolerance)
+        return missed & (self.draw(_STREAM_REPEAT, 1)[:, 0] < self.config.goal_repeat)
 
     def _place_cup(self, mask: Tensor) -> None:
         """Shift the standing cup of some worlds on the table."""
