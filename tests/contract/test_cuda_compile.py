@@ -33,7 +33,6 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "own_contacts": (1, 6),
     "near_rows": (0, 104),
     "near_unknowns": (0, 95),
-    "is_short": (False, True),
     "held_rows": (8,),
     "held_sides": (9,),
     "modes": (48, 96),
@@ -74,14 +73,7 @@ def factories(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
 def is_slow(module: str, choice: dict[str, Any]) -> bool:
     """Whether others that compile in less time show as much, as they are written in the same way."""
     usual = {"law": "neo_hookean", "own_contacts": 1, "near_rows": 104, "project": True}
-    usual |= {
-        "by_parameters": True,
-        "is_large": False,
-        "together": True,
-        "varying": False,
-        "near_unknowns": 0,
-        "is_short": False,
-    }
+    usual |= {"by_parameters": True, "is_large": False, "together": True, "varying": False, "near_unknowns": 0}
     return module.removeprefix("kernels.") in LONG or any(
         choice.get(key, value) != value for key, value in usual.items()
     )

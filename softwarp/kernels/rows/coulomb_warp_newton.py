@@ -48,7 +48,7 @@ def functions(
     first_contact = max(own_rows, 1)
     Numbers = Laws
 
-    systems = warp_system.functions(variant, near_unknowns, is_short=own_contacts == 1)
+    systems = warp_system.functions(variant, near_unknowns)
     system_of, put, got = systems.system_of, systems.put, systems.got
 
     @wp.func

@@ -299,32 +299,27 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
         for k in range(wp.static(own_contacts)):
             e = wp.static(own_rows) + 3 * k
             left = threads_with(change[e] != real(0.0) or change[e + 1] != real(0.0) or change[e + 2] != real(0.0))
-            while left != 0:
+            while left != 0:  # columns of two contacts are loaded at a time
                 one = lowest_bit(left)
                 left = without_lowest(left)
-                j = rows + 3 * (one + wp.static(WIDTH) * k)
-                line0 = column(delassus, w, order, j, thread, rows, count)
-                line1 = column(delassus, w, order, j + 1, thread, rows, count)
-                line2 = column(delassus, w, order, j + 2, thread, rows, count)
-                if wp.static(own_contacts > 1):  # columns of two contacts are on their way at a time
-                    is_pair = left != 0
-                    two = wp.where(is_pair, lowest_bit(left), one)
-                    left = without_lowest(left)
-                    j = rows + 3 * (two + wp.static(WIDTH) * k)
-                    next0 = column(delassus, w, order, j, thread, rows, count)
-                    next1 = column(delassus, w, order, j + 1, thread, rows, count)
-                    next2 = column(delassus, w, order, j + 2, thread, rows, count)
-                    gap += line0 * told(change[e], one)
-                    gap += line1 * told(change[e + 1], one)
-                    gap += line2 * told(change[e + 2], one)
-                    share = wp.where(is_pair, real(1.0), real(0.0))
-                    gap += next0 * (share * told(change[e], two))
-                    gap += next1 * (share * told(change[e + 1], two))
-                    gap += next2 * (share * told(change[e + 2], two))
-                else:
-                    gap += line0 * told(change[e], one)
-                    gap += line1 * told(change[e + 1], one)
-                    gap += line2 * told(change[e + 2], one)
+                is_pair = left != 0
+                two = wp.where(is_pair, lowest_bit(left), one)
+                left = without_lowest(left)
+                i = rows + 3 * (one + wp.static(WIDTH) * k)
+                j = rows + 3 * (two + wp.static(WIDTH) * k)
+                line0 = column(delassus, w, order, i, thread, rows, count)
+                line1 = column(delassus, w, order, i + 1, thread, rows, count)
+                line2 = column(delassus, w, order, i + 2, thread, rows, count)
+                next0 = column(delassus, w, order, j, thread, rows, count)
+                next1 = column(delassus, w, order, j + 1, thread, rows, count)
+                next2 = column(delassus, w, order, j + 2, thread, rows, count)
+                gap += line0 * told(change[e], one)
+                gap += line1 * told(change[e + 1], one)
+                gap += line2 * told(change[e + 2], one)
+                share = wp.where(is_pair, real(1.0), real(0.0))
+                gap += next0 * (share * told(change[e], two))
+                gap += next1 * (share * told(change[e + 1], two))
+                gap += next2 * (share * told(change[e + 2], two))
         return gap
 
     return SimpleNamespace(

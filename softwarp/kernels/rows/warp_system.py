@@ -21,9 +21,9 @@ _SOLVE = """
 SCALAR* const far = (SCALAR*)&wp::index(system_out, w, 0);
 #if NEAR > 0
 #if defined(__CUDA_ARCH__)
-__shared__ SCALAR near[(NEAR + SPARE) * (NEAR + 2)];
+__shared__ SCALAR near[(NEAR + LINES) * (NEAR + 2)];
 #else
-static SCALAR near[(NEAR + SPARE) * (NEAR + 2)];
+static SCALAR near[(NEAR + LINES) * (NEAR + 2)];
 #endif
 const bool is_near = unknowns <= NEAR;
 if (!solves) return (wp::uint64)(size_t)(is_near ? near : far);
@@ -42,8 +42,8 @@ static SCALAR slot;
 // no load asks whether it must: lines behind the last one may be read and written, and a thread without a column of its
 // own reads that of the right side.
 // ``columns`` has the size of a thread's share of the columns, ``entries`` that of a line, if it is known.
-auto solved = [&](const auto& columns, SCALAR* const a, const auto& entries, const auto& group) {
-    const int COLUMNS = sizeof(columns), LINES = sizeof(group), pitch = sizeof(entries) > 1 ? sizeof(entries) : stride;
+auto solved = [&](const auto& columns, SCALAR* const a, const auto& entries) {
+    const int COLUMNS = sizeof(columns), pitch = sizeof(entries) > 1 ? sizeof(entries) : stride;
     SCALAR* own[COLUMNS];
     #pragma unroll
     for (int m = 0; m < COLUMNS; ++m) own[m] = a + (thread + 32 * m < unknowns ? thread + 32 * m : unknowns);
@@ -135,23 +135,19 @@ auto solved = [&](const auto& columns, SCALAR* const a, const auto& entries, con
     MEET
     return total;
 };
-const char one[1] = {}, two[2] = {}, all[MOST / 32 + 1] = {}, few[SPARE / 2] = {}, many[SPARE] = {};
+const char one[1] = {}, two[2] = {}, all[MOST / 32 + 1] = {};
 SCALAR total;
 #if NEAR > 0
 const char entries[NEAR + 2] = {};
 if (is_near) {
-    if (unknowns < 32) total = solved(one, near, entries, many);
-    else if (unknowns < 64) total = solved(two, near, entries, many);
-    else total = solved(all, near, entries, many);
+    if (unknowns < 32) total = solved(one, near, entries);
+    else if (unknowns < 64) total = solved(two, near, entries);
+    else total = solved(all, near, entries);
 } else
 #endif
-#if IS_SHORT
-total = solved(all, far, one, few);
-#else
-if (unknowns < 32) total = solved(one, far, one, many);
-else if (unknowns < 64) total = solved(two, far, one, many);
-else total = solved(all, far, one, many);
-#endif
+if (unknowns < 32) total = solved(one, far, one);
+else if (unknowns < 64) total = solved(two, far, one);
+else total = solved(all, far, one);
 #undef MEET
 #undef TELL
 return (total < 0 ? -total : total) < ENDLESS ? 0 : 1;
@@ -169,20 +165,15 @@ def entries(rows: int) -> int:
 
 
 @cache
-def functions(variant: Variant, near_unknowns: int, *, is_short: bool = False) -> SimpleNamespace:
+def functions(variant: Variant, near_unknowns: int) -> SimpleNamespace:
     """``system_of``, ``put`` and ``got`` for one scalar type of the ``cuda`` variant.
 
-    Args:
-        variant: Scalar type.
-        near_unknowns: Systems of up to so many lie in shared memory, which one world then has to itself.
-        is_short: Whether code is short rather than fast, for worlds that have to fetch it for some small systems.
+    Systems of up to ``near_unknowns`` lie in shared memory, which one world then has to itself.
     """
     real = variant.real
     source = _SOLVE.replace("SCALAR", name_of(real)).replace("MOST", str(MOST)).replace("ENDLESS", str(ENDLESS))
 
-    source = source.replace("IS_SHORT", str(int(is_short))).replace("NEAR", str(near_unknowns))
-
-    @wp.func_native(source.replace("SPARE", str(LINES)))
+    @wp.func_native(source.replace("NEAR", str(near_unknowns)).replace("LINES", str(LINES)))
     def system_of(
         system_out: wp.array2d(dtype=real), w: int, thread: int, unknowns: int, stride: int, solves: bool
     ) -> wp.uint64:
