@@ -115,6 +115,7 @@ class RepeatingEuler:
         self.fewer = wp.array([*counts[1:], 0], dtype=wp.int32, device=s.device)
         self.again = memory.zeros((s.packs, 1, s.lanes), wp.int32, s.device)
         self.order = memory.zeros((worlds,), wp.int32, s.device)
+        self.groups = memory.zeros((-(-worlds // repeats.GROUP),), wp.int32, s.device)
         self.progress = memory.zeros((repeats.ROWS,), wp.int32, s.device)
         self.left = memory.zeros((1,), wp.int32, s.device)
         self.more = memory.zeros((len(counts),), wp.int32, s.device)
@@ -148,9 +149,10 @@ class RepeatingEuler:
         s = self.shard
         self.progress.zero_()
         self.order.zero_()
+        self.groups.zero_()
         inputs = [s.options.repeat_swing, s.lanes, s.world_count, s.work.swing.real]
-        s.each_real(self.k.choose, None, inputs, [self.again, self.progress])
-        s.each_real(self.k.number, None, [s.lanes, self.again], [self.order])
+        s.each_real(self.k.choose, None, inputs, [self.again, self.progress, self.groups])
+        s.each_real(self.k.number, None, [s.lanes, self.again, self.groups], [self.order])
         self._go_on(0)
 
     def _keep(self) -> None:

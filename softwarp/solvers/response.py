@@ -23,8 +23,8 @@ from softwarp.kernels.rows import (
     coulomb,
     coulomb_tiers,
     coulomb_warp,
-    coulomb_warp_newton,
     delassus,
+    warp_system,
 )
 from softwarp.model.codes import FAR, USUAL_SLOTS
 from softwarp.model.structure import IntArray, Symbolic
@@ -164,7 +164,7 @@ class ContactResponse:
         vectors = anderson.VECTORS if self.variant.world_fastest else anderson.HISTORY
         self.history, self.gram = whole(vectors * self.order), whole(anderson.GRAM)
         is_cuda = self.variant.world_fastest
-        self.system = whole(coulomb_warp_newton.entries(self.order) if is_cuda else 1)
+        self.system = whole(warp_system.entries(self.order) if is_cuda else 1)
         if laws is None:
             laws = StaticLaws(*(real(count) for count in (*[self.static_rows] * 3, 1)))
             laws.floor.fill(-FAR)
@@ -276,7 +276,7 @@ class ContactResponse:
         outputs = [multiplier.S, c.multiplier.S, self.change.S]
         if self.variant.world_fastest:
             outputs += [self.history.S, self.system.S, self.residual.S]
-            limits += [extent, coulomb_warp_newton.stride_of(self.order)]
+            limits += [extent, warp_system.stride_of(self.order)]
             self._solve_by_warps(structure, [*limits, self.skipped.S, *inputs], outputs)
         else:
             outputs += [self.curve.S, self.history.S, self.gram.S, self.residual.S]
@@ -339,8 +339,7 @@ class ContactResponse:
     def _solve_by_warps(self, structure: list[Any], inputs: list[Any], outputs: list[Any]) -> None:
         width = coulomb_tiers.WIDTH
         tiers = coulomb_tiers.tiers(self.variant, self.static_rows, self.capacity)
-        # Each waits for its slowest world. Further looks are in a part of a graph of their own, which has one branch
-        aside = len(tiers) if self.branches is not None and self.skipped is self.everyone else 1
+        aside = len(tiers) if self.branches is not None else 1  # each waits for its slowest world
         with nullcontext([None]) if self.branches is None else self.branches.side_by_side(aside) as streams:
             for number, tier in enumerate(tiers):
                 own = -(-self.static_rows // width), tier.own_contacts, tier.near_rows, tier.near_unknowns

@@ -27,6 +27,7 @@ from softwarp.solvers.workspace.rows import Rows
 
 PARTS = 8  # threads that share the entries of one contact's rows of W on a GPU
 PANEL_PARTS = 16  # the same where a world's sides stand together
+FEW_WORLDS, FEW_PARTS = 128, 64  # and of so few worlds, which do not fill a GPU: a thread for nearly every entry
 
 
 class ContactSides:
@@ -241,7 +242,9 @@ class PanelSides(ContactSides):
             contact.kernels(self.variant, together=True),
             contact_panel.kernels(self.variant, wide=self.is_wide),
         )
-        self.parts = PANEL_PARTS if self.variant.world_fastest else 1
+        self.parts = 1
+        if self.variant.world_fastest:
+            self.parts = PANEL_PARTS if self.world_count > FEW_WORLDS else FEW_PARTS
         self.path_limit = longest_path(panel[:, 2], self.slots, panel[:, 1])
         self.side = self._whole(9 * capacity * self.path_limit)
         self.path_size = self._whole(capacity, wp.int32)

@@ -160,6 +160,33 @@ def kernels(variant: Variant) -> SimpleNamespace:
         v = v * (wp.sqrt(wp.max(real(1.0) - most * most, real(0.0))) / wp.length(v))
         return quat(v[0], v[1], v[2], most)
 
+    @wp.func
+    def is_near_most(now: real, turn: real):
+        """Whether a closer look is due at ends that are turned so far, and that a step turns by so much: squared."""
+        return now < real(wp.static(cos(0.5 * (MOST_TURN - CHANGE)))) or turn > real(CHANGE * CHANGE)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def turn_of_segment(
+        h: real,
+        # Model
+        piece_telescope: wp.array(dtype=wp.int32),
+        piece_place: wp.array(dtype=wp.int32),
+        base_frame: wp.array(dtype=wp.int32),
+        frame_dof: wp.array(dtype=wp.int32),
+        # Workspace in
+        pose_in: wp.array3d(dtype=real),
+        u_in: wp.array3d(dtype=real),
+        # Workspace out
+        near_out: wp.array3d(dtype=real),
+    ):
+        """1 for a segment that ``hold_turns`` would look at closer as things are; for a GPU, where few are, 0 else."""
+        pack, segment, lane = wp.tid()
+        frame = base_frame[piece_telescope[segment]] + piece_place[segment]
+        p = quat_at(pose_in, pack, lane, 7 * frame + 3)
+        q = quat_at(pose_in, pack, lane, 7 * frame + 10)
+        turn = way_between(u_in, frame_dof[2 * frame + 1], frame_dof[2 * frame + 3], h, pack, lane)
+        near_out[pack, segment, lane] = wp.where(is_near_most(wp.abs(wp.dot(p, q)), turn), real(1.0), real(0.0))
+
     @wp.kernel(module=module, enable_backward=False)
     def hold_turns(
         h: real,
@@ -170,16 +197,31 @@ def kernels(variant: Variant) -> SimpleNamespace:
         dof_free: wp.array2d(dtype=real),
         # Workspace in
         pose_in: wp.array3d(dtype=real),
+        near_in: wp.array3d(dtype=real),
         # Workspace out
         u_out: wp.array3d(dtype=real),
     ):
         """No segment's ends turn against each other by more than ``MOST_TURN``, or more than they do already.
 
-        From the base on, the far end is turned back to that, about the axis that it was to turn about.
+        From the base on, the far end is turned back to that, about the axis that it was to turn about. A GPU follows
+        the line only where ``turn_of_segment`` has found something to look at, or the end before has just been turned.
         """
         pack, lane = wp.tid()
+        if wp.static(world_fastest):
+            nearest = real(0.0)
+            for segment in range(near_in.shape[1]):
+                nearest = wp.max(nearest, near_in[pack, segment, lane])
+            if nearest == real(0.0):
+                return
+        segment = int(-1)
         for item in range(pieces.shape[0]):
+            follows = bool(not world_fastest)
             for place in range(pieces[item]):
+                segment += 1
+                if wp.static(world_fastest):
+                    if not follows and near_in[pack, segment, lane] == real(0.0):
+                        continue
+                    follows = False
                 frame = base_frame[item] + place
                 a = frame_dof[2 * frame + 1]
                 b = frame_dof[2 * frame + 3]
@@ -187,7 +229,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
                 q = quat_at(pose_in, pack, lane, 7 * frame + 10)
                 now = wp.abs(wp.dot(p, q))
                 turn = way_between(u_out, a, b, h, pack, lane)
-                if now < real(wp.static(cos(0.5 * (MOST_TURN - CHANGE)))) or turn > real(CHANGE * CHANGE):
+                if is_near_most(now, turn):
                     start = wp.quat_inverse(p) * q
                     if start[3] < real(0.0):
                         start = -start
@@ -200,8 +242,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
                     if end[3] < most and free != real(0.0):
                         back = p * turned_back(end, most) * wp.quat_inverse(q)
                         put(u_out, pack, lane, 3 * b, logarithm(back) / h)
+                        follows = True
 
     return SimpleNamespace(
+        turn_of_segment=turn_of_segment,
         hold_turns=hold_turns,
         swing_of_segment=swing_of_segment,
         share_of_segments=share_of_segments,

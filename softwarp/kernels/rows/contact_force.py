@@ -7,9 +7,11 @@ import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
 from softwarp.kernels.rows import contact as contact_rows
+from softwarp.kernels.rows.warp_share import lowest_bit
 from softwarp.model.codes import SLOTS
 
 CHUNK = 8  # slots whose loop the compiler unrolls; a part of SLOTS
+TOGETHER = 4  # contacts that it searches at a time: a bit of a whole number for each slot
 HELD = 24  # slots that a thread may have found before it adds them
 SHARING = 32  # threads that share the dofs of a world, a power of two
 ALL_BITS = 2**31 - 1
@@ -125,39 +127,77 @@ def kernels(variant: Variant) -> SimpleNamespace:
         """Add the forces of contacts on dofs whose bits of ``mask`` are those of ``own``.
 
         A warp waits for the thread in it that has something to add, so slots are searched first and added then.
-        Slots are filled from the first one on.
+        Slots are filled from the first one on. Some contacts are searched at a time, so that their loads do not wait
+        for each other, in their first slots, which are usually all.
         """
         held = Held()
         found = int(0)
-        for contact in range(count):
-            first = wp.static(SLOTS) * contact
-            end = first + wp.static(SLOTS)
-            while first < end:
-                last = int(-1)
-                for place in range(wp.static(CHUNK)):  # unrolled: these loads do not wait for each other
-                    last = dofs[pack, first + place, lane]
-                    if last >= 0 and last & mask == own:
-                        held[found] = first + place
-                        found += 1
-                if found > wp.static(HELD - CHUNK):
-                    add_slots(
-                        held,
-                        found,
-                        dof_free,
-                        dofs,
-                        weight,
-                        lever,
-                        axes,
-                        multiplier,
-                        f_scale,
-                        pack,
-                        lane,
-                        target_out,
-                    )
-                    found = 0
-                first += wp.static(CHUNK)
-                if last < 0:
-                    first = end
+        begin = int(0)
+        while begin < count:
+            matches = int(0)
+            goes_on = bool(False)  # some contact may have more slots than the first ones
+            for place in range(wp.static(CHUNK)):  # unrolled
+                for other in range(wp.static(TOGETHER)):
+                    dof = int(-1)
+                    if begin + other < count:
+                        dof = dofs[pack, wp.static(SLOTS) * (begin + other) + place, lane]
+                    if dof >= 0 and dof & mask == own:
+                        matches = matches | (1 << (wp.static(CHUNK) * other + place))
+                    if place == wp.static(CHUNK - 1) and dof >= 0:
+                        goes_on = True
+            if not goes_on:
+                while matches != 0:
+                    bit = lowest_bit(matches)
+                    matches = matches & (matches - 1)
+                    held[found] = wp.static(SLOTS) * (begin + bit // wp.static(CHUNK)) + bit % wp.static(CHUNK)
+                    found += 1
+                    if found > wp.static(HELD - CHUNK):
+                        add_slots(
+                            held,
+                            found,
+                            dof_free,
+                            dofs,
+                            weight,
+                            lever,
+                            axes,
+                            multiplier,
+                            f_scale,
+                            pack,
+                            lane,
+                            target_out,
+                        )
+                        found = 0
+            else:
+                for contact in range(begin, wp.min(begin + wp.static(TOGETHER), count)):
+                    first = wp.static(SLOTS) * contact
+                    end = first + wp.static(SLOTS)
+                    while first < end:
+                        last = int(-1)
+                        for place in range(wp.static(CHUNK)):  # unrolled: these loads do not wait for each other
+                            last = dofs[pack, first + place, lane]
+                            if last >= 0 and last & mask == own:
+                                held[found] = first + place
+                                found += 1
+                        if found > wp.static(HELD - CHUNK):
+                            add_slots(
+                                held,
+                                found,
+                                dof_free,
+                                dofs,
+                                weight,
+                                lever,
+                                axes,
+                                multiplier,
+                                f_scale,
+                                pack,
+                                lane,
+                                target_out,
+                            )
+                            found = 0
+                        first += wp.static(CHUNK)
+                        if last < 0:
+                            first = end
+            begin += wp.static(TOGETHER)
         add_slots(held, found, dof_free, dofs, weight, lever, axes, multiplier, f_scale, pack, lane, target_out)
 
     @wp.kernel(module=module, enable_backward=False)

@@ -8,8 +8,9 @@ import warp as wp
 from softwarp.kernels.algebra.lanes import Variant
 
 WIDTH = 32  # threads of a warp
+LINES = 8  # of Newton's system that are eliminated at a time, and that stand free behind its last one
 # Kernels with one world a block: contacts of a thread, bytes of shared memory for the matrix and for Newton's system
-NEAR = ((1, 22000, 0), (2, 49152, 0), (2, 0, 37000))
+NEAR = ((1, 22000, 0), (2, 49152, 0), (2, 0, 37000), (3, 0, 37000))
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ def tiers(variant: Variant, rows: int, capacity: int) -> list[Tier]:
     for own, available, spare in NEAR:
         entries = available // size
         near_rows = (math.isqrt(8 * entries + 1) - 1) // 2
-        unknowns = max(math.isqrt(spare // size + 1) - 1, 0)
+        # (unknowns + LINES) (unknowns + 2) entries at most
+        unknowns = max((math.isqrt((LINES - 2) ** 2 + 4 * (spare // size)) - LINES - 2) // 2, 0)
         unknowns -= 1 - unknowns % 2 if unknowns else 0  # lines of an odd number of entries lie in banks of their own
         room = (near_rows - rows) // 3 if available else capacity
         most = min(room, WIDTH * own, capacity)

@@ -11,131 +11,23 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear.cholesky_panels import name_of
-from softwarp.kernels.rows import warp_share
+from softwarp.kernels.rows import warp_share, warp_system
 from softwarp.kernels.rows.coulomb_newton import DAMPING, EVENTS, GROWN, HEAVY, LONGEST, ON_CONE, PIVOT
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
-from softwarp.kernels.rows.warp_share import first_thread, meet, places, told_number
+from softwarp.kernels.rows.warp_share import (
+    first_thread,
+    lowest_bit,
+    meet,
+    places,
+    threads_with,
+    told_number,
+    without_lowest,
+)
 
-MOST = 95  # rows of a system up to which it is solved: all worlds wait for the one that takes longest
-LINES = 4  # that are eliminated at a time, so that loads need not wait for each other
 TRIES = 10  # ways that are gone before a world goes on with the acceleration
 
 NONE, FIXED, LOW, HIGH, FREE, OPEN, BARE, STICK, SLIDE = range(9)  # no law that holds; those of rows, then of contacts
 GOES, RESTS, LOST, LARGE = range(4)  # what came of it: a way, nothing to solve, no solution, too many rows
-ENDLESS = 1.0e30
-
-# A line of the system: one entry per unknown, the right side, and behind the last one 1 / pivot. Threads own columns;
-# the solution ends in the column of the right side.
-_SOLVE = """
-#if defined(__CUDA_ARCH__)
-#define MEET __syncwarp();
-#define TELL(value, source) __shfl_sync(0xffffffffu, value, source)
-#else
-static SCALAR slot;
-#define MEET WP_TILE_SYNC();
-#define TELL(value, source) ({ if (thread == source) slot = value; MEET const SCALAR told = slot; MEET told; })
-#endif
-const int COLUMNS = MOST / 32 + 1;
-SCALAR* const a = (SCALAR*)system;
-const int parts = unknowns / 32 + 1;
-SCALAR top[COLUMNS], next[COLUMNS];
-for (int k = 0; k < unknowns; k += 2) {
-    SCALAR* const pivots = a + k * stride;
-    SCALAR* const others = pivots + stride;
-    const bool is_pair = k + 1 < unknowns;
-    const SCALAR pivot = pivots[k], least = pivots[unknowns + 1];
-    const SCALAR inverse = (pivot < 0 ? -pivot : pivot) > least ? (SCALAR)1 / pivot : (SCALAR)0;
-    const SCALAR beside = is_pair ? pivots[k + 1] * inverse : (SCALAR)0;
-    const SCALAR below = is_pair ? others[k] : (SCALAR)0;
-    const SCALAR second = is_pair ? others[k + 1] - below * beside : (SCALAR)0;
-    const SCALAR lesser = is_pair ? others[unknowns + 1] : (SCALAR)0;
-    const SCALAR reciprocal = (second < 0 ? -second : second) > lesser ? (SCALAR)1 / second : (SCALAR)0;
-    for (int m = 0; m < COLUMNS; ++m) {
-        const int c = thread + 32 * m;
-        const bool is_own = m < parts && c > k + 1 && c <= unknowns;
-        top[m] = is_own ? pivots[c] * inverse : (SCALAR)0;
-        next[m] = is_own && is_pair ? others[c] - below * top[m] : (SCALAR)0;
-    }
-    MEET
-    for (int m = 0; m < COLUMNS; ++m) {
-        const int c = thread + 32 * m;
-        if (m >= parts || c <= k + 1 || c > unknowns || !is_pair) continue;
-        others[c] = next[m];
-        next[m] *= reciprocal;
-    }
-    for (int r = k + 2; r < unknowns; r += LINES) {
-        SCALAR* const line = a + r * stride;
-        const int last = unknowns - r < LINES ? unknowns - r : LINES;
-        SCALAR factor[LINES], further[LINES];
-        for (int i = 0; i < LINES; ++i) {
-            factor[i] = i < last ? line[i * stride + k] : (SCALAR)0;
-            further[i] = i < last ? line[i * stride + k + 1] - factor[i] * beside : (SCALAR)0;
-        }
-        for (int m = 0; m < COLUMNS; ++m) {
-            const int c = thread + 32 * m;
-            if (m >= parts || c <= k + 1 || c > unknowns) continue;
-            SCALAR entry[LINES];
-            for (int i = 0; i < LINES; ++i) entry[i] = i < last ? line[i * stride + c] : (SCALAR)0;
-            for (int i = 0; i < LINES; ++i)
-                if (i < last) line[i * stride + c] = entry[i] - factor[i] * top[m] - further[i] * next[m];
-        }
-    }
-    MEET
-    if (thread == 0) {
-        pivots[unknowns + 1] = inverse;
-        if (is_pair) others[unknowns + 1] = reciprocal;
-    }
-}
-MEET
-SCALAR x[COLUMNS], total = 0;
-for (int m = 0; m < COLUMNS; ++m) {
-    const int u = thread + 32 * m;
-    x[m] = u < unknowns ? a[u * stride + unknowns] : (SCALAR)0;
-}
-for (int k = unknowns - 1; k >= 0; --k) {
-    SCALAR own = 0;
-    for (int m = 0; m < COLUMNS; ++m) own = m == k / 32 ? x[m] : own;
-    const SCALAR solved = TELL(own, k % 32) * a[k * stride + unknowns + 1];
-    total += solved;
-    for (int m = 0; m < COLUMNS; ++m) {
-        const int u = thread + 32 * m;
-        if (u < k) x[m] -= a[u * stride + k] * solved;
-        else if (u == k) x[m] = solved;
-    }
-}
-for (int m = 0; m < COLUMNS; ++m) {
-    const int u = thread + 32 * m;
-    if (u < unknowns) a[u * stride + unknowns] = x[m];
-}
-MEET
-#undef MEET
-#undef TELL
-return total;
-"""
-
-# Where the system lies: in memory that the threads of a block share, if it fits there.
-_PLACE = """
-#if NEAR > 0
-#if defined(__CUDA_ARCH__)
-__shared__ SCALAR near[NEAR * (NEAR + 2)];
-#else
-static SCALAR near[NEAR * (NEAR + 2)];
-#endif
-if (unknowns <= NEAR) return (wp::uint64)(size_t)near;
-#endif
-return (wp::uint64)(size_t)&wp::index(system_out, w, 0);
-"""
-
-
-def stride_of(rows: int) -> int:
-    """Entries of a line of the system of a world with so many rows: unknowns, right side, reciprocal pivot."""
-    return min(rows, MOST) + 2
-
-
-def entries(rows: int) -> int:
-    """Entries of the system of a world with so many rows."""
-    return min(rows, MOST) * stride_of(rows)
 
 
 @cache
@@ -156,19 +48,8 @@ def functions(
     first_contact = max(own_rows, 1)
     Numbers = Laws
 
-    @wp.func_native(_PLACE.replace("SCALAR", name_of(real)).replace("NEAR", str(near_unknowns)))
-    def place_of(system_out: wp.array2d(dtype=real), w: int, unknowns: int) -> wp.uint64:
-        """Address of the first line of a world's system."""
-
-    @wp.func_native(f"(({name_of(real)}*)system_out)[entry] = value;")
-    def put(system_out: wp.uint64, entry: int, value: real): ...
-
-    @wp.func_native(f"return (({name_of(real)}*)system)[entry];")
-    def got(system: wp.uint64, entry: int) -> real: ...
-
-    @wp.func_native(_SOLVE.replace("SCALAR", name_of(real)).replace("MOST", str(MOST)).replace("LINES", str(LINES)))
-    def solve(system: wp.uint64, thread: int, unknowns: int, stride: int) -> real:
-        """Solve the system; the sum of the solution, which is endless where one of its numbers is."""
+    systems = warp_system.functions(variant, near_unknowns)
+    system_of, put, got = systems.system_of, systems.put, systems.got
 
     @wp.func
     def held_rows(
@@ -222,14 +103,15 @@ def functions(
             e = wp.static(own_rows) + 3 * k
             kind = law[wp.static(first_contact) + k]
             place = begin + first[wp.static(first_contact) + k]
-            if kind == wp.static(SLIDE):
-                put(system, place, line[e] + mu[k] * (n1[k] * line[e + 1] + n2[k] * line[e + 2]))
-                put(system, place + 1, n1[k] * line[e + 2] - n2[k] * line[e + 1])
-            elif kind > wp.static(OPEN):
-                put(system, place, line[e])
-                if kind == wp.static(STICK):
-                    put(system, place + 1, line[e + 1])
-                    put(system, place + 2, line[e + 2])
+            slides = kind == wp.static(SLIDE)
+            pushed = line[e] + mu[k] * (n1[k] * line[e + 1] + n2[k] * line[e + 2])
+            turned = n1[k] * line[e + 2] - n2[k] * line[e + 1]
+            if kind > wp.static(OPEN):
+                put(system, place, wp.where(slides, pushed, line[e]))
+            if kind >= wp.static(STICK):
+                put(system, place + 1, wp.where(slides, turned, line[e + 1]))
+            if kind == wp.static(STICK):
+                put(system, place + 2, line[e + 2])
 
     @wp.func
     def fill_all(
@@ -259,26 +141,37 @@ def functions(
                     line = column(delassus, w, order, owner + wp.static(WIDTH) * k, thread, rows, count)
                     fill(system, line, law, first, mu, n1, n2, begin)
         for k in range(wp.static(own_contacts)):
-            owner = int(-1)
-            is_left = bool(True)
-            while is_left:
-                owner = first_thread(law[wp.static(first_contact) + k] > wp.static(OPEN) and thread > owner)
-                is_left = owner >= 0
-                if is_left:
-                    kind = told_number(law[wp.static(first_contact) + k], owner)
-                    begin = stride * told_number(first[wp.static(first_contact) + k], owner)
-                    c1 = -told(n2[k], owner)
-                    c2 = told(n1[k], owner)
-                    j = rows + 3 * (owner + wp.static(WIDTH) * k)
-                    line0 = column(delassus, w, order, j, thread, rows, count)
-                    line1 = column(delassus, w, order, j + 1, thread, rows, count)
-                    line2 = column(delassus, w, order, j + 2, thread, rows, count)
-                    fill(system, line0, law, first, mu, n1, n2, begin)
-                    if kind == wp.static(SLIDE):
-                        fill(system, line1 * c1 + line2 * c2, law, first, mu, n1, n2, begin + stride)
-                    if kind == wp.static(STICK):
-                        fill(system, line1, law, first, mu, n1, n2, begin + stride)
-                        fill(system, line2, law, first, mu, n1, n2, begin + 2 * stride)
+            left = threads_with(law[wp.static(first_contact) + k] > wp.static(OPEN))
+            owner = lowest_bit(left)
+            j = rows + 3 * (wp.max(owner, 0) + wp.static(WIDTH) * k)
+            line0 = Owned()
+            line1 = Owned()
+            line2 = Owned()
+            if owner >= 0:
+                line0 = column(delassus, w, order, j, thread, rows, count)
+                line1 = column(delassus, w, order, j + 1, thread, rows, count)
+                line2 = column(delassus, w, order, j + 2, thread, rows, count)
+            while owner >= 0:  # the columns of the next contact are loaded before those of this one are written
+                left = without_lowest(left)
+                following = lowest_bit(left)
+                j = rows + 3 * (wp.max(following, owner) + wp.static(WIDTH) * k)
+                next0 = column(delassus, w, order, j, thread, rows, count)
+                next1 = column(delassus, w, order, j + 1, thread, rows, count)
+                next2 = column(delassus, w, order, j + 2, thread, rows, count)
+                kind = told_number(law[wp.static(first_contact) + k], owner)
+                begin = stride * told_number(first[wp.static(first_contact) + k], owner)
+                c1 = -told(n2[k], owner)
+                c2 = told(n1[k], owner)
+                fill(system, line0, law, first, mu, n1, n2, begin)
+                if kind == wp.static(SLIDE):
+                    fill(system, line1 * c1 + line2 * c2, law, first, mu, n1, n2, begin + stride)
+                if kind == wp.static(STICK):
+                    fill(system, line1, law, first, mu, n1, n2, begin + stride)
+                    fill(system, line2, law, first, mu, n1, n2, begin + 2 * stride)
+                line0 = next0
+                line1 = next1
+                line2 = next2
+                owner = following
 
     @wp.func
     def complete(system: wp.uint64, right: real, extra: real, unknown: int, unknowns: int, stride: int):
@@ -373,7 +266,7 @@ def functions(
                 if unknowns == 0:
                     break
 
-                lines = place_of(system, w, unknowns)
+                lines = system_of(system, w, thread, unknowns, stride, False)
                 pitch = wp.where(unknowns <= wp.static(near_unknowns), wp.static(near_unknowns + 2), stride)
                 meet()
                 fill_all(lines, delassus, law, first, mu, n1, n2, w, thread, order, rows, count, pitch)
@@ -402,8 +295,7 @@ def functions(
                         slip = n2[k] * slack[e + 1] - n1[k] * slack[e + 2]
                         complete(lines, slip, turn[k], u + 1, unknowns, pitch)
                 meet()
-                total = solve(lines, thread, unknowns, pitch)
-                if not (wp.abs(total) < real(wp.static(ENDLESS))):
+                if system_of(system, w, thread, unknowns, stride, True) != wp.uint64(0):
                     verdict = int(LOST)
                     break
 

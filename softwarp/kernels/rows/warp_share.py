@@ -10,11 +10,62 @@ from types import SimpleNamespace
 import warp as wp
 
 from softwarp.kernels.algebra.lanes import Variant
-from softwarp.kernels.linear.cholesky_panels import name_of, shared_memory
+from softwarp.kernels.linear.cholesky_panels import name_of
 from softwarp.kernels.rows.coulomb_tiers import WIDTH
 
 COPIED_ROWS = 8  # of the matrix that are on their way to shared memory at once
 
+# Threads without a contact of their own read what the last one has, which costs less than to ask each time.
+_NEAR = """
+#if defined(__CUDA_ARCH__)
+__shared__ SCALAR near[SIZE];
+#else
+static SCALAR near[SIZE];
+#endif
+wp::vec_t<OWN_ROWS + 3 * OWN, SCALAR> share;
+if (writes) {
+    near[place] = value;
+    return share;
+}
+const int own = j * (j + 1) / 2;
+#pragma unroll
+for (int k = 0; k < OWN_ROWS; ++k) {
+    const int i = thread + 32 * k;
+    share[k] = i < rows ? near[i < j ? own + i : i * (i + 1) / 2 + j] : (SCALAR)0;
+}
+if (count > 0) {
+    #pragma unroll
+    for (int k = 0; k < OWN; ++k) {
+        const int i = rows + 3 * (thread + 32 * k < count ? thread + 32 * k : count - 1), line = i * (i + 1) / 2;
+        const int lines[3] = {line, line + i + 1, line + 2 * i + 3};
+        #pragma unroll
+        for (int axis = 0; axis < 3; ++axis)
+            share[OWN_ROWS + 3 * k + axis] = near[i + axis < j ? own + i + axis : lines[axis] + j];
+    }
+}
+return share;
+"""
+
+# Numbers of a line of W that stand behind one another: one address for a contact's three.
+_FAR = """
+const SCALAR* const line = &wp::index(delassus, w, j * order);
+wp::vec_t<OWN_ROWS + 3 * OWN, SCALAR> share;
+#pragma unroll
+for (int k = 0; k < OWN_ROWS; ++k) {
+    const int row = thread + 32 * k;
+    share[k] = row < rows ? line[row] : (SCALAR)0;
+}
+if (count > 0) {
+    #pragma unroll
+    for (int k = 0; k < OWN; ++k) {
+        const int contact = thread + 32 * k < count ? thread + 32 * k : count - 1;
+        const SCALAR* const own = line + rows + 3 * contact;
+        #pragma unroll
+        for (int axis = 0; axis < 3; ++axis) share[OWN_ROWS + 3 * k + axis] = own[axis];
+    }
+}
+return share;
+"""
 
 # Where the threads of a warp are fibers of a block on a CPU, which tests use, they tell each other through memory.
 _ALL = """
@@ -63,6 +114,34 @@ def meet():
 )
 def first_thread(flag: bool) -> int:
     """The first thread whose flag is set; -1 for none."""
+
+
+@wp.func_native(
+    everyone(
+        "return (int)__ballot_sync(0xffffffffu, flag);",
+        "bool",
+        "flag",
+        "unsigned bits = 0;\nfor (int k = 0; k < 32; ++k) bits |= (unsigned)slots[k] << k;\nconst int result = bits;",
+    )
+)
+def threads_with(flag: bool) -> int:
+    """A bit for each thread, set where its flag is."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return __ffs(bits) - 1;
+#else
+return __builtin_ffs(bits) - 1;
+#endif
+""")
+def lowest_bit(bits: int) -> int:
+    """Number of the lowest bit that is set; -1 for none."""
+
+
+@wp.func_native("return (int)((unsigned)bits & ((unsigned)bits - 1u));")
+def without_lowest(bits: int) -> int:
+    """The same bits but for the lowest one that is set."""
 
 
 @wp.func_native(from_source("int"))
@@ -162,8 +241,11 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 for axis in range(3):
                     target[w, i + axis] = share[wp.static(own_rows) + 3 * k + axis]
 
-    @wp.func_native(shared_memory(real, max(near_rows * (near_rows + 1) // 2, 1)))
-    def near_entry(place: int, value: real, write: bool) -> real: ...
+    near_source = _NEAR.replace("SCALAR", name_of(real)).replace("SIZE", str(max(near_rows * (near_rows + 1) // 2, 1)))
+
+    @wp.func_native(near_source.replace("OWN_ROWS", str(own_rows)).replace("OWN", str(own_contacts)))
+    def near_share(j: int, thread: int, rows: int, count: int, place: int, value: real, writes: bool) -> Owned:
+        """The thread's entries of column j of the lower triangle in shared memory; or write one entry of that."""
 
     @wp.func
     def bring_near(delassus: wp.array2d(dtype=real), w: int, order: int, thread: int, total: int):
@@ -178,35 +260,21 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 for k in range(wp.static(COPIED_ROWS)):
                     row = first + k
                     if row < total and column <= row:
-                        near_entry(row * (row + 1) / 2 + column, values[k], True)
+                        near_share(0, thread, 0, 0, row * (row + 1) / 2 + column, values[k], True)
         meet()
 
     @wp.func
-    def near_value(i: int, j: int):
-        """Entry (i, j) of W from shared memory."""
-        low = wp.min(i, j)
-        high = wp.max(i, j)
-        return near_entry(high * (high + 1) / 2 + low, real(0.0), False)
-
-    @wp.func
     def near_column(delassus: wp.array2d(dtype=real), w: int, order: int, j: int, thread: int, rows: int, count: int):
-        """The thread's entries of column j of W, from shared memory."""
-        share = Owned()
-        for k in range(wp.static(own_rows)):
-            row = thread + wp.static(WIDTH) * k
-            if row < rows:
-                share[k] = near_value(row, j)
-        for k in range(wp.static(own_contacts)):
-            contact = thread + wp.static(WIDTH) * k
-            if contact < count:
-                for axis in range(3):
-                    share[wp.static(own_rows) + 3 * k + axis] = near_value(rows + 3 * contact + axis, j)
-        return share
+        """The thread's entries of column j of W, from shared memory; any number where it owns nothing."""
+        return near_share(j, thread, rows, count, 0, real(0.0), False)
 
-    @wp.func
-    def far_column(delassus: wp.array2d(dtype=real), w: int, order: int, j: int, thread: int, rows: int, count: int):
-        """The thread's entries of column j of W, which is symmetric, from a row of it in the device's memory."""
-        return load(delassus, w, j * order, thread, rows, count)
+    @wp.func_native(
+        _FAR.replace("SCALAR", name_of(real)).replace("OWN_ROWS", str(own_rows)).replace("OWN", str(own_contacts))
+    )
+    def far_column(
+        delassus: wp.array2d(dtype=real), w: int, order: int, j: int, thread: int, rows: int, count: int
+    ) -> Owned:
+        """The same of column j of W, which is symmetric, from a row of it in the device's memory."""
 
     column = near_column if near_rows else far_column
 
@@ -229,15 +297,29 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 if d != real(0.0):
                     gap += column(delassus, w, order, owner + wp.static(WIDTH) * k, thread, rows, count) * d
         for k in range(wp.static(own_contacts)):
-            for owner in range(wp.min(count - wp.static(WIDTH) * k, wp.static(WIDTH))):
-                d0 = told(change[wp.static(own_rows) + 3 * k], owner)
-                d1 = told(change[wp.static(own_rows) + 3 * k + 1], owner)
-                d2 = told(change[wp.static(own_rows) + 3 * k + 2], owner)
-                if d0 != real(0.0) or d1 != real(0.0) or d2 != real(0.0):
-                    j = rows + 3 * (owner + wp.static(WIDTH) * k)
-                    gap += column(delassus, w, order, j, thread, rows, count) * d0
-                    gap += column(delassus, w, order, j + 1, thread, rows, count) * d1
-                    gap += column(delassus, w, order, j + 2, thread, rows, count) * d2
+            e = wp.static(own_rows) + 3 * k
+            left = threads_with(change[e] != real(0.0) or change[e + 1] != real(0.0) or change[e + 2] != real(0.0))
+            while left != 0:  # columns of two contacts are loaded at a time
+                one = lowest_bit(left)
+                left = without_lowest(left)
+                is_pair = left != 0
+                two = wp.where(is_pair, lowest_bit(left), one)
+                left = without_lowest(left)
+                i = rows + 3 * (one + wp.static(WIDTH) * k)
+                j = rows + 3 * (two + wp.static(WIDTH) * k)
+                line0 = column(delassus, w, order, i, thread, rows, count)
+                line1 = column(delassus, w, order, i + 1, thread, rows, count)
+                line2 = column(delassus, w, order, i + 2, thread, rows, count)
+                next0 = column(delassus, w, order, j, thread, rows, count)
+                next1 = column(delassus, w, order, j + 1, thread, rows, count)
+                next2 = column(delassus, w, order, j + 2, thread, rows, count)
+                gap += line0 * told(change[e], one)
+                gap += line1 * told(change[e + 1], one)
+                gap += line2 * told(change[e + 2], one)
+                share = wp.where(is_pair, real(1.0), real(0.0))
+                gap += next0 * (share * told(change[e], two))
+                gap += next1 * (share * told(change[e + 1], two))
+                gap += next2 * (share * told(change[e + 2], two))
         return gap
 
     return SimpleNamespace(

@@ -146,6 +146,10 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                 owner = first_thread((is_loaded or is_met) and thread > owner)
                 is_left = owner >= 0
                 if is_left:
+                    j = rows + 3 * (owner + wp.static(WIDTH) * k)  # columns are on their way while the owner works
+                    line0 = column(delassus, w, order, j, thread, rows, count)
+                    line1 = column(delassus, w, order, j + 1, thread, rows, count)
+                    line2 = column(delassus, w, order, j + 2, thread, rows, count)
                     step0 = real(0.0)
                     step1 = real(0.0)
                     step2 = real(0.0)
@@ -165,13 +169,9 @@ def functions(variant: Variant, own_rows: int, own_contacts: int, near_rows: int
                         change[e + 2] += step2
                         slide = wp.max(wp.abs(step1), wp.abs(step2)) * (weight[e + 1] + weight[e + 2])
                         worst = wp.max(worst, wp.max(wp.abs(step0) * (weight[e] + soft[k]), slide))
-                    step0 = told(step0, owner)
-                    step1 = told(step1, owner)
-                    step2 = told(step2, owner)
-                    j = rows + 3 * (owner + wp.static(WIDTH) * k)
-                    gap += column(delassus, w, order, j, thread, rows, count) * step0
-                    gap += column(delassus, w, order, j + 1, thread, rows, count) * step1
-                    gap += column(delassus, w, order, j + 2, thread, rows, count) * step2
+                    gap += line0 * told(step0, owner)
+                    gap += line1 * told(step1, owner)
+                    gap += line2 * told(step2, owner)
         return value, change, gap, curve, worst
 
     return SimpleNamespace(visit_rows=visit_rows, visit_contacts=visit_contacts)

@@ -11,6 +11,7 @@ from softwarp.kernels.algebra.lanes import Variant, single_worlds
 from softwarp.model.codes import Status
 
 COUNT, DONE, ROWS = range(3)  # of the progress through the worlds that repeat
+GROUP = 64  # neighbouring worlds that are counted together
 
 
 @single_worlds
@@ -45,6 +46,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         # Workspace out
         again_out: wp.array3d(dtype=wp.int32),
         progress_out: wp.array(dtype=wp.int32),
+        group_out: wp.array(dtype=wp.int32),
     ):
         """A world repeats its step if that swings a segment by more than ``limit`` [rad], or is not finite."""
         pack, lane = wp.tid()
@@ -54,6 +56,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             if not (swing_in[pack, 0, lane] <= limit):
                 again = int(1)
                 wp.atomic_add(progress_out, wp.static(COUNT), 1)  # of integers: the same in any order
+                wp.atomic_add(group_out, world // wp.static(GROUP), 1)
         again_out[pack, 0, lane] = again
 
     @wp.kernel(module=module, enable_backward=False)
@@ -61,6 +64,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
         lanes: int,
         # Workspace in
         again_in: wp.array3d(dtype=wp.int32),
+        group_in: wp.array(dtype=wp.int32),
         # Workspace out
         order_out: wp.array(dtype=wp.int32),
     ):
@@ -70,7 +74,10 @@ def kernels(variant: Variant) -> SimpleNamespace:
             return
         world = pack * lanes + lane
         before = int(0)
-        for other in range(world):
+        own = world // wp.static(GROUP)
+        for group in range(own):
+            before += group_in[group]
+        for other in range(wp.static(GROUP) * own, world):
             before += again_in[other // lanes, 0, other % lanes]
         order_out[before] = world
 

@@ -17,6 +17,7 @@ from softwarp.shapes.base import Kind
 from softwarp.solvers.collision.trees import Trees
 
 CHUNK_CPU, CHUNK_GPU = 64, 4  # keys that one thread searches
+FEW_KEYS, CHUNK_FEW = 256, 2  # on a GPU, and of scenes with few keys, where a thread then has but one feature
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,9 @@ def _chunks(
     scene: CollisionScene, put: _Packer
 ) -> tuple[wp.array, wp.array, wp.array, wp.array, wp.array, wp.array, wp.array]:
     """Cut the keys of every couple into pieces for one thread each; keys of one feature stay together."""
-    size = CHUNK_GPU if put.variant.world_fastest else CHUNK_CPU
+    size = CHUNK_CPU
+    if put.variant.world_fastest:
+        size = CHUNK_FEW if scene.key_count <= FEW_KEYS else CHUNK_GPU
     key: list[int] = []
     owner: list[int] = []
     kinds: tuple[list[int], list[int]] = ([], [])

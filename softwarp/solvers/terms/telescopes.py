@@ -160,8 +160,12 @@ class TelescopeTerm(Term):
         inputs = [s.model.dof_free, w.share_of_way.real]
         s.each_real(k.hold_back, s.variant.parts(s.model.dof_count), inputs, [w.u.real])
         linear = s.options.newton_iterations == 1  # looks at contacts have moved the poses since
-        inputs = [h, m.pieces, m.base_frame, f.frame_dof, s.model.dof_free]
-        s.each_real(k.hold_turns, None, [*inputs, s.input["pose0"].real if linear else w.pose.real], [w.u.real])
+        pose, near = s.input["pose0"].real if linear else w.pose.real, w.segment_swing.real
+        if s.variant.world_fastest:
+            inputs = [h, m.piece_telescope, m.piece_place, m.base_frame, f.frame_dof, pose, w.u.real]
+            s.each_real(k.turn_of_segment, m.piece_count, inputs, [near])
+        inputs = [h, m.pieces, m.base_frame, f.frame_dof, s.model.dof_free, pose, near]
+        s.each_real(k.hold_turns, None, inputs, [w.u.real])
 
     def write(self) -> None:
         """Lengths, angles and sections of good worlds."""

@@ -8,7 +8,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softwarp.kernels.algebra import lanes
-from softwarp.kernels.rows import anderson, coulomb, coulomb_warp, coulomb_warp_newton
+from softwarp.kernels.rows import anderson, coulomb, coulomb_warp, warp_system
 
 FAR = 1.0e9
 Array = NDArray[np.float64]
@@ -58,9 +58,9 @@ def swept(
     else:
         own = -(-rows // 32), -(-count // 32), near, unknowns
         kernel = coulomb_warp.kernels(lanes.variant("cuda", precision), *own).gauss_seidel
-        structure = [bounded, rows, order, -1, count, *limits, coulomb_warp_newton.stride_of(order)]
+        structure = [bounded, rows, order, -1, count, *limits, warp_system.stride_of(order)]
         structure.append(wp.zeros((1, 1), dtype=wp.int32, device=device))
-        outputs = [multiplier, force, change, history, zeros(coulomb_warp_newton.entries(order)), residual]
+        outputs = [multiplier, force, change, history, zeros(warp_system.entries(order)), residual]
         wp.launch(kernel, (1, 32), [*structure, *inputs], outputs, device=device, block_dim=32)
     gap = case.free + case.matrix @ change.numpy()[0].astype(float)
     return multiplier.numpy()[0].astype(float), force.numpy()[0].astype(float), gap, float(residual.numpy()[0, 0])
@@ -144,5 +144,5 @@ def test_more_rows_than_newton_takes_are_left_to_the_acceleration(monkeypatch: p
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     case = Case(0, 60, 300)
     _, force, gap, residual = swept(case, "float64", 200, near=0)
-    assert 3 * np.count_nonzero(force[::3]) > coulomb_warp_newton.MOST
+    assert 3 * np.count_nonzero(force[::3]) > warp_system.MOST
     assert residual < 1e-8 and gap[::3].min() > -1e-7
