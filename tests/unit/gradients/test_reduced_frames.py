@@ -136,7 +136,7 @@ TOUCHING = {
     "joints and a ball, floating": partial(chained, touches=True, floating=True),
     "a ball, floating": partial(chained, joints=False, touches=True, floating=True),
 }
-SOLVED: dict[str, Any] = {"newton_iterations": 60, "newton_tolerance": 1e-13, "project_tangent": False}
+SOLVED: dict[str, Any] = {"newton_iterations": 100, "newton_tolerance": 1e-13, "project_tangent": False}
 ON_A_GPU = ["joints", "joints, floating", "a body with a memory, floating"]
 FAST = ["joints", "joints and a memory, floating"]
 
