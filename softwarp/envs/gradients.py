@@ -454,6 +454,9 @@ def require_gradient(env: Any) -> None:
     integrator = env.sim.options.integrator  # type: ignore[attr-defined]
     if found is None and integrator != "euler":
         found = f"steps of integrator {integrator!r} have no gradient in environments; take integrator='euler'"
+    iterations = env.sim.options.newton_iterations  # type: ignore[attr-defined]
+    if found is None and iterations > 1:  # which keep no solutions, and may end before they converge
+        found = f"steps with newton_iterations={iterations} have no gradient in environments; take newton_iterations=1"
     if found is not None:
         raise ValueError(f"{name}: {found}; or {out}")
 

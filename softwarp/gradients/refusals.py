@@ -154,20 +154,12 @@ def _reduced(sim: Simulation) -> Iterator[str]:
     model, told = sim.model, "reduced bodies have no gradient"
     if model.reduction is None:
         return
-    if model.reduction.floating is not None and model.has_moving_frames:
-        parts = "rods, and rigid bodies that move or carry something"
-        yield f"{told} in a floating frame beside {parts}, yet; train the reduction with frame='fixed'"
     if sim.options.newton_iterations > 1:
         count = sim.options.newton_iterations
         if model.reduction.floating is not None:
             yield f"{told} in a floating frame with newton_iterations={count} yet; take newton_iterations=1"
-        if model.contact is not None:
-            yield f"{told} beside contact with newton_iterations={count} yet; take newton_iterations=1"
-        if model.has_moving_frames or model.relaxes:
-            parts = "rods, moving rigid bodies and Maxwell branches"
-            yield f"{told} beside {parts} with newton_iterations={count} yet; take newton_iterations=1"
-    if model.joints is not None:
-        yield f"{told} beside joints yet; take the full mesh"
+        if model.relaxes:
+            yield f"{told} beside Maxwell branches with newton_iterations={count} yet; take newton_iterations=1"
 
 
 def _rods(sim: Simulation) -> Iterator[str]:

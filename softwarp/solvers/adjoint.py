@@ -447,11 +447,11 @@ class StepAdjoint:
             outputs = [self.node_v.S, self.node_p.S, self.node_mass_p.S]
             inputs = [m.node_dof, m.node_volume, w.dof_v.S, self.p.S]
             s.each(self.k.to_nodes, s.variant.parts(m.node_count), inputs, outputs)
+        if self.frames is not None:  # before bodies that float take over what all nodes have
+            self.frames.carry(self.p, self.node_v, self.node_p)
         if self.modes is not None:
             everywhere = self.by_forces or (self.modes.frames is not None and s.variant.world_fastest)
             self.modes.place(w.dof_v, self.p, self.node_v, self.node_p, everywhere=everywhere)
-        if self.frames is not None:
-            self.frames.carry(self.p, self.node_v, self.node_p)
         self._feel()
         if self.leaning is not None:
             self.leaning.push(self.seed, self.q)
@@ -464,7 +464,9 @@ class StepAdjoint:
         elements = (self.element_v, self.node_p, self.stiffness, h, self.corner)
         frames = None if self.modes is None else self.modes.frames
         if frames is not None:
-            nodal = (self.node_v, self.node_p, self.p, self.corner)
+            if self.leaning is not None:
+                self.leaning.lean_more(self.node_v, frames.own_v)
+            nodal = (self.element_v, self.node_p, self.p, self.corner)
             frames.pull(self.tets, self.skin, *nodal, parameters=parameters)
         elif self.tets is not None:
             self.tets.pull(*elements, parameters=parameters)

@@ -249,7 +249,7 @@ class FloatingAdjoint:
         Args:
             tets: Linear tetrahedra.
             skin: Membranes.
-            node_v: Velocities of nodes.
+            node_v: What elements have in the place of velocities of nodes; ``own_v`` is that without turning.
             node_p: Their p.
             p: That of dofs.
             corner: Receives gradients by corners.
@@ -337,3 +337,8 @@ class FloatingAdjoint:
         self._of_moments(self.start_bar, self.q0_bar, g.mode_q)
         inputs = [s.lanes, self.start.turn.real, self.turn_bar.real]
         s.each_real(self.k.give_turns, self.model.count, inputs, [g.mode_turn])
+
+    def forget(self) -> None:
+        """What has been told to the start of the step does not count again, for another solution of it."""
+        for bar in (self.turn_bar, self.start_bar, self.q0_bar):
+            bar.zero()

@@ -14,7 +14,7 @@ import warp as wp
 
 from softwarp.kernels.frames import gyration_adjoint
 from softwarp.kernels.rows import joint_adjoint
-from softwarp.model.gradients import FRAMES, JOINTS, MEMORIES, STATE, Gradients
+from softwarp.model.gradients import FLOATING, FRAMES, JOINTS, MEMORIES, MODES, STATE, Gradients
 from softwarp.solvers.adjoint import StepAdjoint
 from softwarp.solvers.adjoint_index import AdjointIndex
 from softwarp.solvers.frame_adjoint import FrameAdjoint
@@ -92,7 +92,7 @@ class JointAdjoint(JointSides):
         self.owner, s = owner, owner.shard
         self.h, self.last = owner.h, owner.system.passes
         self.k, self.k_free = joint_adjoint.kernels(s.variant), gyration_adjoint.kernels(s.variant)
-        dofs, rows, turning = 3 * s.model.dof_count, s.model.row_count, 6 * max(term.gyrating, 1)
+        dofs, rows, turning = 3 * s.model.dof_room, s.model.row_count, 6 * max(term.gyrating, 1)
         self.u, self.force, self.differences = (
             [s.rows(count) for _ in range(1 + self.last)] for count in (dofs, rows, turning)
         )
@@ -111,14 +111,23 @@ class JointAdjoint(JointSides):
         if owner.leaning is not None:
             owner.leaning.multiply = self._multiply
         g = owner.gradients
-        names = [*STATE, *FRAMES, *JOINTS, *MEMORIES, *(f.name for f in fields(g) if f.name.startswith("command_"))]
+        names = [
+            *STATE,
+            *FRAMES,
+            *JOINTS,
+            *MEMORIES,
+            *MODES,
+            *FLOATING,
+            *(f.name for f in fields(g) if f.name.startswith("command_")),
+        ]
         parts = [getattr(g, name) for name in names]
         self.sums = [(part, wp.zeros(part.shape, dtype=part.dtype, device=s.device)) for part in parts if part.size]
 
     def _allocate(self, dofs: int, rows: int) -> None:
         s, frames, term = self.shard, 6 * self.frames.model.count, self.term
         self.end_v, self.inertial_v, self.response, self.needed_response = (s.rows(dofs) for _ in range(4))
-        self.seed, self.seed_kept, self.p_kept, self.still, self.against = (s.rows(dofs) for _ in range(5))
+        self.p_kept = s.rows(dofs)
+        self.seed, self.seed_kept, self.still, self.against = (s.rows(3 * s.model.dof_count) for _ in range(4))
         self.known, self.other, self.twist, self.p_frame, self.drift = (s.rows(frames) for _ in range(5))
         self.free = s.rows(frames)
         self.known_bar, self.bar, self.bar_before, self.place, self.velocity_bar = (s.rows(frames) for _ in range(5))
@@ -260,6 +269,8 @@ class JointAdjoint(JointSides):
         nothing = self._zeros(g.node_x)
         s.each_real(owner.k.seed, parts, [*scalars, nothing, g.node_v], [frames.kept.real, y])
         s.each_real(owner.k.seed, parts, [*scalars, g.node_x, nothing], [self.seed.real, y])
+        if owner.modes is not None:  # which keep the velocities that they move with
+            owner.modes.seed(self.seed, owner.system.linear.y, arrives=True)
         frames.seed(self.seed, owner.system.linear.y)
         if owner.leaning is not None:
             owner.leaning.seed(self.seed, owner.system.linear.y)
@@ -424,6 +435,8 @@ class JointAdjoint(JointSides):
         if ends:
             self._add(WHOLE, 1.0, self.place, frames.start)
         owner.to_start(parameters=parameters)
+        if owner.modes is not None and owner.modes.frames is not None:
+            owner.modes.frames.forget()
         frames.start, frames.moved, frames.bare = own
         self.place.zero()
         if held is self.none:

@@ -209,6 +209,12 @@ class Leaning:
             if self.frames.differences is not None:
                 self.frames.differences(self.frames.felt_v)
 
+    def lean_more(self, node_v: Rows, own_v: Rows) -> None:
+        """Add what elements have beside velocities of nodes to those that they feel without turning."""
+        s = self.shard
+        inputs = [self.element_v.real, node_v.real]
+        s.each_real(self.k.lean_more, 3 * self.model.body_node_count, inputs, [own_v.real])
+
     def push(self, seed: Rows, q: Rows) -> None:
         """Find s = A p: the seed less what rows have."""
         s, m, w = self.shard, self.model, self.shard.work

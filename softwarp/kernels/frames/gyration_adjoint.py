@@ -356,7 +356,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
             taken += needed_gap_in[pack, row, lane] * needed_in[pack, row, lane]
             given += gap_in[pack, row, lane] * given_in[pack, row, lane]
         by_share = real(0.0)
-        for row in range(response_in.shape[1]):
+        for row in range(kept_bar_in.shape[1]):
             by_share -= response_in[pack, row, lane] * kept_bar_in[pack, row, lane]
         share = real(0.0)
         by_taken = real(0.0)

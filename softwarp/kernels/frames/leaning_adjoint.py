@@ -82,6 +82,19 @@ def kernels(variant: Variant) -> SimpleNamespace:
             put(element_v_out, pack, lane, 3 * node, v - (real(1.0) - d) * v0 + d * y)
 
     @wp.kernel(module=module, enable_backward=False)
+    def lean_more(
+        # Workspace in
+        element_v_in: wp.array3d(dtype=real),
+        v_in: wp.array3d(dtype=real),
+        # Workspace out
+        own_v_out: wp.array3d(dtype=real),
+    ):
+        """Add to another velocity of nodes what elements have beside v."""
+        pack, row, lane = wp.tid()
+        more = element_v_in[pack, row, lane] - v_in[pack, row, lane]
+        own_v_out[pack, row, lane] = own_v_out[pack, row, lane] + more
+
+    @wp.kernel(module=module, enable_backward=False)
     def carried_velocities(
         nodes: int,
         body_nodes: int,
@@ -521,6 +534,7 @@ def kernels(variant: Variant) -> SimpleNamespace:
 
     return SimpleNamespace(
         velocities=velocities,
+        lean_more=lean_more,
         carried_velocities=carried_velocities,
         twists=twists,
         carried_gradients=carried_gradients,

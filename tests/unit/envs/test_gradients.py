@@ -132,6 +132,11 @@ def test_steps_of_one_environment_keep_what_each_is_told_to(monkeypatch: pytest.
         ("Diamond", {"reward": "paper"}, "Diamond: reward='paper' has no gradient"),
         ("Diamond", {"inversion_penalty": 1.0}, "Diamond: inversion_penalty has no gradient"),
         ("Diamond", {"integrator": "bdf2"}, "Diamond: steps of integrator 'bdf2' have no gradient"),
+        (
+            "Diamond",
+            {"newton_iterations": 5},
+            "Diamond: steps with newton_iterations=5 have no gradient in environments",
+        ),
     ],
 )
 def test_what_has_no_gradient_is_refused_by_name(name: str, options: dict[str, object], message: str) -> None:

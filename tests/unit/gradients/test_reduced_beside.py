@@ -14,8 +14,10 @@ from tests.cases import FITTED
 from tests.gradient_cases import STEPS, Inputs, gradients
 from tests.reduction_cases import SLAB, reduced_by, scene, smooth_modes
 from tests.unit.gradients import test_every_input, test_reduced
+from tests.unit.gradients.test_contact import EXACT, SLIPPING, STUCK
 from tests.unit.gradients.test_forward_frames import compare
 from tests.unit.gradients.test_rods import check
+from tests.unit.gradients.test_touches import modes
 
 SLOW = pytest.mark.slow
 SOLVED: dict[str, Any] = {"newton_iterations": 40, "newton_tolerance": 1e-13, "project_tangent": False}
@@ -62,7 +64,7 @@ def given_of(sim: sw.Simulation, seeds: list[int]) -> tuple[Inputs, dict[str, di
         found: dict[str, dict[str, Any]] = {"state": {}, "controls": {}, "parameters": {}}
         for name in STATE:
             if name != "node_v" or sim.model.own_node_count:
-                start = getattr(sim, name)[0].numpy()
+                start = getattr(sim, name)[0].cpu().numpy()
                 found["state"][name] = start + spread[name] * rng.standard_normal(start.shape)
         found["state"]["body_pose"][:, :3] += 1e-4 * rng.standard_normal((sim.model.rigid_count, 3))  # else at a kink
         for name in CONTROLS:
@@ -71,7 +73,7 @@ def given_of(sim: sw.Simulation, seeds: list[int]) -> tuple[Inputs, dict[str, di
                 change = size.get(name, 0.002 * volume) * rng.standard_normal(shape)
                 found["controls"][name] = mean.get(name, 0.0) + change
         for name in PARAMETERS:
-            value = getattr(sim.params, name)[0].numpy()
+            value = getattr(sim.params, name)[0].cpu().numpy()
             if value.size and np.any(value):
                 found["parameters"][name] = value.copy()
         for group, parts in found.items():
@@ -121,6 +123,28 @@ def test_gradients_of_solved_steps_are_those_of_differences(integrator: str) -> 
     check(Rollout(sim), test_reduced.given_of(sim, [1]), test_reduced.loss, test_reduced.SIZES)
 
 
+def lying(num_worlds: int = 1, on: str = "floor", dt: float = 0.001, **options: Any) -> sw.Simulation:
+    """The slab on something, in steps that are so short that iterations converge beside contacts."""
+    sim = test_reduced.slab(num_worlds, on=on, softness=test_reduced.SOFTNESS)
+    return sw.Simulation(sim.model, dt=dt, **{**EXACT, **SOLVED, "newton_tolerance": 1e-12, **options})
+
+
+@pytest.mark.parametrize(
+    ("on", "options"),
+    [
+        ("floor", {}),
+        pytest.param("floor", {"dt": 0.002, "newton_iterations": 100, "newton_tolerance": 1e-13}, marks=SLOW),
+        pytest.param("bed", {"dt": 0.002, "newton_iterations": 60, "newton_tolerance": 1e-13}, marks=SLOW),
+    ],
+)
+def test_gradients_of_solved_steps_beside_contact(on: str, options: dict[str, Any]) -> None:
+    """Contacts are found where each iteration leads to, and count where the step ends."""
+    sim = lying(on=on, **options)
+    given = test_reduced.given_of(sim, [1], nodes=sim.model.own_node_count > 0)
+    check(Rollout(sim), given, test_reduced.loss, test_reduced.SIZES)
+    assert modes(sim, given) & {STUCK, SLIPPING}
+
+
 @pytest.mark.parametrize("integrator", ["euler", pytest.param("bdf2", marks=SLOW)])
 def test_worlds_beside_change_no_bit(integrator: str) -> None:
     """Three worlds, and each alone."""
@@ -137,7 +161,16 @@ def test_worlds_beside_change_no_bit(integrator: str) -> None:
 @pytest.mark.parametrize("integrator", ["euler", "bdf2"])
 def test_worlds_beside_change_no_bit_of_solved_steps(integrator: str) -> None:
     """The slab alone: three worlds, and each by itself."""
-    batch, single = (test_reduced.slab(count, integrator=integrator, **SOLVED) for count in (3, 1))
+    of_worlds(*(test_reduced.slab(count, integrator=integrator, **SOLVED) for count in (3, 1)))
+
+
+def test_worlds_beside_change_no_bit_of_solved_steps_beside_contact() -> None:
+    """The slab on a floor likewise."""
+    of_worlds(lying(3), lying(1))
+
+
+def of_worlds(batch: sw.Simulation, single: sw.Simulation) -> None:
+    """Three worlds, and each by itself."""
     given = test_reduced.given_of
     together, rollout = gradients(Rollout(batch), given(batch, [1, 2, 3]), test_reduced.loss), Rollout(single)
     for world, seed in enumerate((1, 2, 3)):
