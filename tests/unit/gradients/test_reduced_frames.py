@@ -13,6 +13,7 @@ from softwarp.gradients import Rollout, States
 from tests.gradient_cases import STEPS, Inputs, gradients
 from tests.reduction_cases import SLAB, quadratic_modes, reduced_by, scene, smooth_modes
 from tests.unit.gradients import test_reduced_beside as beside
+from tests.unit.gradients import test_rods as rods
 from tests.unit.gradients.test_contact import EXACT, SLIPPING, STUCK
 from tests.unit.gradients.test_forward_frames import compare
 from tests.unit.gradients.test_reduced import SOFTNESS
@@ -160,6 +161,41 @@ def test_gradients_beside_contact_are_those_of_differences(name: str) -> None:
     assert "pair_mu" in given["parameters"]
     if name != "a ball, floating":
         assert modes(sim, given) & {STUCK, SLIPPING}
+
+
+def tied_to_a_rod() -> sw.Simulation:
+    """The slab, in a floating frame, with a cable to the middle of a rod that is clamped."""
+    builder = scene(held=False, contact=False)
+    builder.reduce(0, reduced_by(quadratic_modes(), frame="floating"))
+    line = np.linspace((0.09, 0.015, 0.006), (0.15, 0.015, 0.016), 3)
+    rod = builder.add_rod(line, radius=0.003, youngs=2e6, nu=0.4, density=1100.0, rayleigh=(0.3, 0.01))
+    builder.fix(rod, nodes=[2])
+    path = [(0.03, 0.01, 0.01), (0.055, 0.01, 0.01), (0.12, 0.018, 0.012)]
+    builder.add_cable([0, 0, rod], path, stiffness=200.0, damping=1.0)
+    return sw.Simulation(builder.finalize(num_worlds=1, precision="float64"), dt=0.01, **EXACT)
+
+
+def test_gradients_beside_a_rod_are_those_of_differences() -> None:
+    """In a floating frame, by states, loads and moduli of both."""
+    sim = tied_to_a_rod()
+    given, sizes = given_of(sim, [3])
+    of_rods = rods.bent(sim, [3])
+    given["state"] = {name: value for name, value in given["state"].items() if value.numel()} | of_rods["state"]
+    given["controls"]["rod_force"] = 0.1 * of_rods["controls"]["rod_force"]
+    given["parameters"] |= of_rods["parameters"]
+    sizes = {group: {**held, **rods.SIZES.get(group, {})} for group, held in sizes.items()}
+    sizes["controls"]["cable_displacement"] = 1e-8
+    sizes["state"] |= {**rods.STARTS, "rod_w": 1e-2}  # which change little beside the slab
+    sizes["parameters"] |= {"rod_youngs": 2e3}
+
+    def both(states: States) -> torch.Tensor:
+        rng = np.random.default_rng(9)
+        weight = torch.tensor(rng.standard_normal((STEPS, 1, *states.rod_x.shape[2:])))
+        return loss(states) + 10.0 * (states.rod_x * weight).sum(dim=(0, 2, 3)) + states.rod_q.sum(dim=(0, 2, 3))
+
+    assert (Rollout(sim)(given["state"], given["controls"]).cable_tension[:2] > 1e-3).all()
+    check(Rollout(sim), given, both, sizes)
+    assert {"rod_youngs", "youngs"} <= set(given["parameters"])
 
 
 @SLOW
