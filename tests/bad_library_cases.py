@@ -21,13 +21,13 @@ RECORDS = {
     *("EDGES", "CavityWall", "CupMesh", "FingerMesh", "PadMesh", "SolidMesh", "VesselTree", "Maze", "RodGeometry"),
     *("MembraneGeometry", "MeshError", "MeshReport", "Lumen", "TetMesh", "HexMesh", "SurfaceMesh", "QuadraticMesh"),
     *("Basis", "Deviation", "Motion", "Reduction", "ReductionFileError", "Sampling"),
-    *("Fit", "LeftOut", "Worlds", "Differentiable", "Diverged", "Pose", "States"),
+    *("FingerBricks", "Fit", "LeftOut", "Worlds", "Differentiable", "Diverged", "Pose", "States"),
     *("Effector", "Followed", "Outcome", "Solution", "Steerable", "SteerableTubes", "TubeSolution"),
 }
 # Likewise: they have tests of their own for what they refuse, need a package, or take what meshes are made of.
 ELSEWHERE = {
     *("union", "difference", "intersection", "as_surface", "check_tets", "check_closed", "elevate", "embed", "orient"),
-    *("brick", "check_hexes", "quad_shares"),
+    *("brick", "check_hexes", "finger_bricks", "quad_shares"),
     *("box", "arc", "helix", "straight", "edge_couplings", "face_middles", "face_shares", "mean_edge", "surface_edges"),
     *("membrane_geometry", "orient_surface", "surface_middles", "surface_parts", "surface_rings"),
     *("deviation", "pod", "read_about", "sample_elements", "train", "leave_out", "side_by_side", "jvp"),

@@ -165,7 +165,7 @@ def test_world_of_a_batch_has_the_gradient_of_that_world_alone(
     test_reduced.equal_alone(batch, single, given_of, loss)
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_world_of_a_batch_that_touches_has_the_gradient_of_that_world_alone(precision: str) -> None:
     """The same on a ball."""
     exact = {} if precision == "float64" else {"gauss_seidel_tolerance": 1e-6}
