@@ -73,13 +73,13 @@ SHORT: dict[str, tuple[tuple[str, str, str], ...]] = {
     ),
     "docs/view.md": (
         ("softwarp view env=trunk", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
-        ("softwarp view env=gripper", "seconds=0.5 port=8400", "viser"),
+        ("softwarp view env=gripper", "env.finger=plain seconds=0.5 port=8400", "viser"),
         ("softwarp view env=diamond", "env.mesh=coarse seconds=0.5 port=8400", "viser"),
         ("softwarp export runs/NAME film.npz", FEW, ""),
         ("softwarp view film.npz", "seconds=0.3 port=8400", "viser"),
         ("softwarp view runs/NAME", f"{FEW} seconds=0.3 port=8400", "viser"),
         ("softwarp view plan.json", "seconds=0.3 port=8400", "viser"),
-        ("softwarp export env=gripper", FEW, "viser"),
+        ("softwarp export env=gripper", f"env.finger=plain {FEW}", "viser"),
         ("softwarp export film.npz film.usdc", "", ""),
     ),
 }
