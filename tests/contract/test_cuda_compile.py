@@ -41,18 +41,13 @@ SHARED = 32 * 1024  # bytes of a block up to which nobody doubts that there is r
 COMPILED: set[wp.Kernel] = set()  # found in PTX; a later factory may bring some that stand in a module before it
 
 
-LONG = {
-    *(
-        "collision.keeping",
-        "collision.surface_phase",
-        "collision.shapes_phase",
-        "elements.quadratic",
-        "elements.turning",
-    ),
-    *("elements.floating_adjoint", "elements.directional", "elements.hex_adjoint", "elements.floating_inertia"),
+LONG = {  # without native code of their own, so that what CPUs compile is the same source
+    *("collision.keeping", "collision.surface_phase", "collision.shapes_phase"),
+    *("elements.quadratic", "elements.turning", "elements.directional"),
+    *("elements.floating_adjoint", "elements.floating_inertia"),
     *("frames.gyration", "frames.gyration_adjoint", "frames.inertia", "frames.momentum", "frames.windup"),
-    *("frames.adjoint", "frames.extrapolated_adjoint", "frames.leaning_adjoint", "linear.cholesky_panels"),
-    *("rows.touch_adjoint", "rows.touch_directional", "rows.touch_gather", "rows.joint_adjoint", "rows.contact_panel"),
+    *("frames.adjoint", "frames.extrapolated_adjoint", "frames.leaning_adjoint"),
+    *("rows.touch_adjoint", "rows.touch_directional", "rows.touch_gather", "rows.joint_adjoint"),
     *("inverse.laws", "inverse.program", "inverse.settling"),
 }
 
