@@ -32,7 +32,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "own_rows": (1,),
     "own_contacts": (1, 6),
     "near_rows": (0, 104),
-    "near_unknowns": (0, 95),
+    "near_unknowns": (0, 63),  # as many as coulomb_tiers gives float64
     "held_rows": (8,),
     "held_sides": (9,),
     "modes": (48, 96),
